@@ -28,19 +28,19 @@ def generate_launch_description():
                               description='table description, YAML; the template is refused; none: no table, by hand'),
         DeclareLaunchArgument('urdf', default_value='', description='robot description, path (.urdf, or .xacro with '
                               'allow_xacro: true in params); or topic: '
-                              'robot_description; with table:=none, or one that says where the arm stands'),
+                              'robot_description; with table:=none, or a table with the site of the arm'),
         DeclareLaunchArgument('imu_link', default_value='', description='link that carries the IMU; empty: the frame of its messages'),
         DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'calibration_node.yaml']),
                               description='parameters of the node, YAML'),
         DeclareLaunchArgument('save_file', default_value='',
-                              description='where ~/save writes; empty: calibration.yaml in the working directory, with ~/save alone'),
-        DeclareLaunchArgument('resume', default_value='false', description='go on with the accumulator beside save_file'),
+                              description='file of ~/save; empty: calibration.yaml in the working directory, by ~/save only'),
+        DeclareLaunchArgument('resume', default_value='false', description='continue with the accumulator in the folder of save_file'),
         DeclareLaunchArgument('namespace', default_value='', description='one per IMU when there are several'),
         DeclareLaunchArgument('imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'),
         DeclareLaunchArgument('joint_states', default_value='joint_states', description='topic of sensor_msgs/JointState'),
         DeclareLaunchArgument('temperature', default_value='imu/temperature', description='topic of sensor_msgs/Temperature'),
         DeclareLaunchArgument('foxglove', default_value='false', description='show it live to Foxglove over a websocket'),
-        DeclareLaunchArgument('use_sim_time', default_value='false', description='take the time from /clock'),
+        DeclareLaunchArgument('use_sim_time', default_value='false', description='use the time of /clock'),
         Node(
             package='imu_calibration', executable='calibration_node', namespace=LaunchConfiguration('namespace'), output='screen',
             parameters=[LaunchConfiguration('params'), {

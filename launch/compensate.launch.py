@@ -26,7 +26,7 @@ def generate_launch_description():
         DeclareLaunchArgument('calibration', default_value='',
                               description='calibration.yaml; empty: wait for the latched topic imu/calibration'),
         DeclareLaunchArgument('adopt', default_value='file_then_topic',
-                              description='where calibrations come from: file (in the field), topic (displaces the file), file_then_topic'),
+                              description='source of calibrations: file (in the field), topic (replaces the file), file_then_topic'),
         DeclareLaunchArgument('target_frame', default_value='',
                               description='frame to move the readings to, by the transforms on /tf_static; empty: that of the sensor'),
         DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'compensator_node.yaml']),
@@ -38,7 +38,7 @@ def generate_launch_description():
         DeclareLaunchArgument('ekf_params', default_value=PathJoinSubstitution([CONFIG, 'robot_localization_ekf.yaml']),
                               description='its parameters, YAML'),
         DeclareLaunchArgument('foxglove', default_value='false', description='show it live to Foxglove over a websocket'),
-        DeclareLaunchArgument('use_sim_time', default_value='false', description='take the time from /clock'),
+        DeclareLaunchArgument('use_sim_time', default_value='false', description='use the time of /clock'),
         Node(
             package='imu_calibration', executable='compensator_node', namespace=LaunchConfiguration('namespace'), output='screen',
             parameters=[LaunchConfiguration('params'), {

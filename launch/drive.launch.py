@@ -32,14 +32,14 @@ def generate_launch_description():
         DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_template.yaml']),
                               description='table description with the limits of its joints, YAML; the template is refused'),
         DeclareLaunchArgument('urdf', default_value='', description='robot description (.urdf), path; or topic: '
-                              'robot_description; with table:=none, or one that says where the arm stands'),
+                              'robot_description; with table:=none, or a table with the site of the arm'),
         DeclareLaunchArgument('imu_link', default_value='', description='link that carries the IMU; empty: the frame of its messages'),
         DeclareLaunchArgument('save_file', default_value='',
                               description='where ~/save of calibration_node writes; empty: calibration.yaml in the working directory'),
         DeclareLaunchArgument('imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'),
         DeclareLaunchArgument('joint_states', default_value='joint_states', description='topic of sensor_msgs/JointState'),
         DeclareLaunchArgument('joint_trajectory', default_value='joint_trajectory', description='topic of the controller'),
-        DeclareLaunchArgument('use_sim_time', default_value='false', description='take the time from /clock'),
+        DeclareLaunchArgument('use_sim_time', default_value='false', description='use the time of /clock'),
         _node('calibration_node', topics, table, save),
         _node('planner_node', topics, table),
     ])

@@ -88,7 +88,7 @@ def _check(recording, corrected_topic):
     if foreign:
         raise InputError(f'every topic of {recording.path} must be CDR to be copied, got {", ".join(foreign)}; record without them')
     if corrected_topic in recording.message_counts:
-        raise InputError(f'the corrected topic must be new, {recording.path} has {corrected_topic} already beside {name}; '
+        raise InputError(f'the corrected topic must be new, {recording.path} has {corrected_topic} already in addition to {name}; '
                          'choose another name', code='topic_taken')
 
 

@@ -194,8 +194,8 @@ class JointDecoder(Decoder):
         """Raise InputError when no message so far has held the joints of the table."""
         if self.asked and self.seen and not self.n_fitting:
             if any(set(self.names) <= set(names) for names in self.seen):
-                raise InputError('JointState must hold one position for each joint that it names, the messages so far do not; correct the '
-                                 'driver, or choose another topic', key='joint_topic')
+                raise InputError('JointState must have one position for each named joint, the messages so far do not; correct the '
+                                 'driver, or choose a different topic', key='joint_topic')
             came = '; '.join(', '.join(names) or 'no names' for names in self.seen)
             missing = min(([name for name in self.names if name not in names] for names in self.seen), key=len)
             raise InputError(f'JointState must name the joints of the table ({", ".join(self.names)}), got {came}, which lacks '

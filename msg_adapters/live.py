@@ -112,7 +112,7 @@ class _Topic:
             messages, self.waiting = self.waiting, deque()
             n_lost, self.n_lost = self.n_lost, 0
         if n_lost:
-            self.decoder.dropped[f'{self.decoder.name} message that came faster than it was used'] += n_lost
+            self.decoder.dropped[f'{self.decoder.name} message that was dropped because the queue was full'] += n_lost
         sent_ns = np.array([sent for _, sent in messages], np.int64)
         contents = [message for message, _ in messages]
         arrived_ns = (lambda: sent_ns) if np.all(sent_ns) else None

@@ -108,7 +108,7 @@ def noise_from_text(text: str) -> NoiseFigures:
         raise DocumentError(str(error), code=error.code) from error
     found = str(document.get('format'))
     if found != FORMAT:
-        raise DocumentError(f"a noise document must say 'format: {FORMAT}', got '{found}'; give a file written by 'imu_calibration noise'",
+        raise DocumentError(f"a noise document must have 'format: {FORMAT}', got '{found}'; give a file written by 'imu_calibration noise'",
                             code='document_format')
     try:
         return _parse(document)
@@ -123,7 +123,7 @@ def _parse(document):
                for sensor in SENSORS}
     rate = float(document['sampling_rate'])
     if not (math.isfinite(rate) and rate > 0):
-        raise DocumentError(f'the sampling rate must be above zero, got {rate:g}; write the noise document anew', code='rate_not_positive')
+        raise DocumentError(f'the sampling rate must be above zero, got {rate:g}; write the noise document again', code='rate_not_positive')
     return NoiseFigures(**sensors, rate=rate, frame_id=str(document.get('frame_id', '')), recording=dict(document.get('recording') or {}),
                         tau=tuple(float(t) for t in curve.get('tau') or ()), provenance=dict(document.get('provenance') or {}))
 
@@ -132,7 +132,7 @@ def _axis(section, k, deviation):
     terms = {name: _term(name, section[name], k) for name in TERMS if name in section and section[name]['interval95'][k] is not None}
     for needed in (WHITE.name, RANDOM_WALK.name):
         if needed not in terms:
-            raise DocumentError(f"every axis must have '{needed}', it is missing; write the noise document anew", code='part_missing')
+            raise DocumentError(f"every axis must have '{needed}', it is missing; write the noise document again", code='part_missing')
     alternatives = {name: _term(name, entry, k) for name, entry in (section.get('alternatives') or {}).items()
                     if entry['interval95'][k] is not None}
     trends = tuple(TrendFigure(name, float(entry['value'][k]), float(entry['sd'][k]), float(entry.get('time_constant', [0, 0, 0])[k]))
@@ -154,8 +154,8 @@ def _term(name, entry, k):
     interval = tuple(math.inf if end is None else float(end) for end in entry['interval95'][k])
     if status not in STATUSES or len(interval) != 2 or not 0 <= interval[0] <= interval[1]:
         raise DocumentError(f"'{name}' must have a status ({', '.join(STATUSES)}) and an interval of two numbers in rising order, got "
-                            f'{status!r} and {list(interval)}; write the noise document anew', code='status_or_interval')
+                            f'{status!r} and {list(interval)}; write the noise document again', code='status_or_interval')
     if (value is None) != (status == HELD) or (value is not None and not np.isfinite(float(value))):
         raise DocumentError(f"'{name}' must have a finite value unless it is held, got {value!r} and '{status}'; "
-                            'write the noise document anew', code='value_missing')
+                            'write the noise document again', code='value_missing')
     return Term(name, None if value is None else float(value), interval, status, str((entry.get('reason') or [''] * 3)[k]))

@@ -116,7 +116,7 @@ def _require_scatter(curve):
     names = [f'{sensor} {letter}' for sensor in SENSORS for letter in AXES]
     frozen = [name for name, variance in zip(names, curve.variance.T) if np.sum(variance > 0) < LEAST_SCALES]
     if frozen:
-        raise InputError(f'every axis must scatter at rest, {" and ".join(frozen)} stays on one step of its readings; '
+        raise InputError(f'every axis must scatter at rest, {" and ".join(frozen)} remains on one step of its readings; '
                          'record with a finer resolution', code='coarse_steps')
 
 

@@ -71,7 +71,7 @@ def _random_walk(lag):
     return np.abs(lag)**3 / 12
 
 
-QUANTISATION = NoiseProcess('quantisation', 'Q', 's', _quantisation, 'The output comes in steps: variance 3 Q^2 / tau^2.',
+QUANTISATION = NoiseProcess('quantisation', 'Q', 's', _quantisation, 'The output has discrete steps: variance 3 Q^2 / tau^2.',
                             lattice=True)
 WHITE = NoiseProcess('white_noise', 'N', '/sqrt(Hz)', _white, 'Every sample errs by itself: variance N^2 / tau.')
 FLICKER = NoiseProcess('bias_instability', 'B', '', _flicker,

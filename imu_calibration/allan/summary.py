@@ -15,7 +15,7 @@ from imu_calibration.units import NOISE, for_people, significant
 TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bias_instability': 'bias instability B',
           'gauss_markov': 'Gauss–Markov σ', TIME: 'correlation time τ', 'random_walk': 'random walk K',
           'temperature': 'follows the temperature', 'turn_on': 'settles after turn-on', 'ramp': 'drifts steadily'}
-BASIS = {'walk': 'as found', 'equivalent': 'stands for the slow noise found', 'bound': 'none seen: the largest possible'}
+BASIS = {'walk': 'as found', 'equivalent': 'equivalent of the slow noise', 'bound': 'none detected: upper limit'}
 NO_BOUND = 'no bound'
 WORTH_SAYING = 0.04
 """Scatter of the variances between rests that is said: two per cent of the noise."""
@@ -82,7 +82,7 @@ def _note(axis, term):
     parts = [term.reason] if term.reason else []
     if term.name in axis.record_for:
         seconds = axis.record_for[term.name]
-        parts.append('takes over two days' if seconds is None else f'takes {duration(seconds)}')
+        parts.append('needs more than two days' if seconds is None else f'needs {duration(seconds)}')
     return '; '.join(parts)
 
 
@@ -121,8 +121,8 @@ def lines(figures: NoiseFigures) -> list[str]:
         for letter, axis in zip(AXES, figures.sensor(sensor)):
             found += _axis_lines(f'{sensor} {letter}', sensor, axis)
     if any(name in SLOW for sensor in SENSORS for axis in figures.sensor(sensor) for name in axis.form):
-        found.append('slow noise (bias instability, Gauss–Markov, random walk): the intervals hold for this recording; those of another '
-                     'one can lie outside of them')
+        found.append('slow noise (bias instability, Gauss–Markov, random walk): the intervals are valid for this recording; '
+                     'values of a second recording can lie outside')
     longest = _longest(figures)
     return [*found, *([longest] if longest else []), _metres(figures)]
 
@@ -131,7 +131,7 @@ def _metres(figures):
     """Return what the noise becomes in dead reckoning."""
     runs = [f'{significant(float(np.hypot(*shares.values())), 2)} m after {duration(seconds)}'
             for seconds, shares in position_budget(figures)]
-    return f'dead reckoning from rest errs by noise alone: {", ".join(runs)}'
+    return f'error of dead reckoning from rest by noise only: {", ".join(runs)}'
 
 
 def _rest_line(recording):
@@ -147,12 +147,12 @@ def _axis_lines(name, sensor, axis):
         factor, unit = for_people(UNITS[sensor][trend.name], NOISE)
         constant = f' within {duration(trend.time)}' if trend.name == 'turn_on' else ''
         size = f'{significant(trend.value * factor)} ± {significant(trend.sd * factor, 2)} {unit}'
-        found.append(f'{name} {TITLES[trend.name]}: {size}{constant}; taken out')
+        found.append(f'{name} {TITLES[trend.name]}: {size}{constant}; removed')
     if axis.others:
         others = ' or '.join(said(form) for form in axis.others)
         found.append(f'{name}: {others} explains the curve as well as {said(axis.form)}')
     if axis.excess > 1:
-        found.append(f'{name}: the curve departs from every model by {np.sqrt(axis.excess):.2g} times what chance allows'
+        found.append(f'{name}: the curve deviates from every model by {np.sqrt(axis.excess):.2g} times the chance limit'
                      f'{_hump(sensor, axis)}; intervals are wider by that')
     if axis.scatter > WORTH_SAYING:
         found.append(f'{name}: from rest to rest the noise differs by {axis.scatter / 2:.0%} beyond chance; intervals are wider by that')

@@ -75,11 +75,11 @@ class Proposal:
         text = (f'{100 * self.share:.0f} % of it ({100 * self.ci95[0]:.0f} to {100 * self.ci95[1]:.0f} %, on windows held out) follows '
                 + ' and '.join(f'{column}, {part}' for column, part in zip(self.columns, parts)))
         if self.nearest is not None:
-            text += (f'; it is none of the catalogue: {self.nearest[0]}, which comes nearest, '
+            text += (f'; it is not in the catalogue: {self.nearest[0]}, the closest effect, '
                      f'would remove {100 * max(self.nearest[1], 0.0):.0f} %')
-            text += ' here, but the other axes or the other sensor speak against it' * (self.nearest[1] > LEAST_SHARE)
+            text += ' here, but the remaining axes or sensor contradict it' * (self.nearest[1] > LEAST_SHARE)
         if self.alike:
-            text += f'; this recording cannot tell it from {" or ".join(self.alike)}'
+            text += f'; collinear in this recording: {" or ".join(self.alike)}'
         return text + (f'; to confirm it: {self.motion}' if self.motion else '')
 
     def to_mapping(self) -> dict:
@@ -216,7 +216,7 @@ def _effect(sensor, number, text, formula, values, taken):
     names = (f'{SHORT[sensor]}_proposed_{k}' for k in range(1, 100))
     free = [name for name in names if name not in taken][number]
     return term(free, sensor=sensor, column=text if isinstance(text, str) else list(text), unit=unit, tolerance=_digits(0.1 * largest),
-                tolerance_reason='a tenth of what was found', prior_sd=_digits(10 * largest), largest=_digits(3 * largest),
+                tolerance_reason='a tenth of the estimate', prior_sd=_digits(10 * largest), largest=_digits(3 * largest),
                 text=f'The {sensor} output follows {_joined_text(text)}: a formula that a diagnosis proposed, its cause is not known.')
 
 

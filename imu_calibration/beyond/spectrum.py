@@ -64,7 +64,7 @@ class Tone:
         factor, unit = for_people('m/s^2' if self.sensor == SENSORS[0] else 'rad/s')
         where = f'on {self.sensor} {self.axis}, {significant(self.amplitude * factor, 2)} {unit}'
         if self.joint is None:
-            return f'a tone of {self.frequency:.1f} Hz {where}, whatever moves: electrical, or a resonance'
+            return f'a tone of {self.frequency:.1f} Hz {where}, independent of motion: electrical, or a resonance'
         return f'{self.frequency:.1f} times per turn of {self.joint} {where}, at every speed: its bearing, gear, motor or encoder'
 
     def to_mapping(self) -> dict:

@@ -114,5 +114,5 @@ def notes(moved: Mapping[str, float], duration: float) -> tuple[CheckFinding, ..
     sizes = {'accelerometer': (1e3 / STANDARD_GRAVITY, 'mg'), 'gyroscope': (1 / DEG, 'deg/s')}
     return tuple(CheckFinding('bias_drift', WARNING, f'{sensor} bias moved by {size * sizes[sensor][0]:.2g} {sizes[sensor][1]} in {span}, '
                               'which is in its sd; let the sensor warm up before recording, '
-                              'or record imu/temperature and ask for a thermal bias')
+                              'or record imu/temperature and request a thermal bias')
                               for sensor, size in moved.items())

@@ -274,7 +274,7 @@ def _settled(model, found):
 def _check_temperature(model, poses):
     thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
     if thermal and poses.temperature_c is None:
-        raise InputError(f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or leave it out')
+        raise InputError(f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or omit it')
 
 
 def default_gyroscope(poses: Poses, settings: ByHandSettings) -> tuple[tuple[str, ...], dict]:

@@ -23,7 +23,7 @@ class ArmSettings:
                             'too short: noise of the angular acceleration shortens the arm; too long: fast motion averages out')
     motion_share: float = setting(0.05, '1', 'windows with less lever-arm acceleration than this share of the strongest are left out',
                                   (0.0, 0.9), 'too small: resting windows rule the noise estimate')
-    cluster: float = setting(2.0, 's', 'errors are taken as independent between stretches of this length', (0.1, 100.0),
+    cluster: float = setting(2.0, 's', 'errors are independent between segments of this length', (0.1, 100.0),
                              'too small: sd too small')
     gap: float = setting(0.1, 's', 'windows do not bridge longer holes; never below five periods', (0.001, 60.0), '')
 
@@ -100,7 +100,7 @@ def require_overlap(imu_a: ImuSamples, imu_b: ImuSamples) -> None:
                          code='too_few_samples')
     overlap = min(imu_a.stamp_ns[-1], imu_b.stamp_ns[-1]) - max(imu_a.stamp_ns[0], imu_b.stamp_ns[0])
     if overlap <= 0:
-        raise InputError(f'the two IMUs must have been recorded at the same time, their stamps are {-1e-9 * overlap:.1f} s apart; '
+        raise InputError(f'the two IMUs must have been recorded at the same time, their stamps differ by {-1e-9 * overlap:.1f} s; '
                          'check the clocks', code='no_overlap')
 
 

@@ -210,11 +210,11 @@ def _that_predict(inquiry, held_out, named):
 
 def _why_not(effect, poses, turns, follows_gravity):
     if effect.role is Role.LIMIT:
-        return 'nothing says what clipped samples should have read; turns that touch a limit are left out', 'record on a table'
+        return 'the true values of clipped samples are unknown; turns that reach a limit are excluded', 'record on a table'
     if 'cooling' in effect.needs:
-        return 'which way the temperature came is not followed from pose to pose', 'record on a table'
+        return 'the thermal branch is not tracked between poses', 'record on a table'
     if 'vibration' in effect.needs:
-        return 'poses in the hand are held still, so that nothing vibrates now more, now less', 'record on a table'
+        return 'poses by hand are at rest, so that the vibration does not vary', 'record on a table'
     if not possible_by_hand(effect):
         return 'gravity in poses and the turns between them do not show it', 'record on a table'
     if 'temperature' in effect.needs and poses.temperature_c is None:
@@ -223,7 +223,7 @@ def _why_not(effect, poses, turns, follows_gravity):
         return (f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only',
                 'record while the sensor warms up by at least some kelvins')
     if effect.role is Role.CROSS and not follows_gravity:   # the question that calibration asks, with the same answer
-        return ('beside a bias that moves in time the rates at rest do not show it', 'hold each attitude again later, in another order')
+        return ('rates at rest do not separate it from a bias that moves in time', 'hold each attitude again later, in a different order')
     moving = effect.sensor == 'gyroscope' and any('rate' in group.uses for group in effect.groups)
     if moving and len([t for t in turns if t.rotation is None]) < 6:
         return 'there are fewer than six turns between poses', 'turn it by half a turn between poses'

@@ -184,7 +184,7 @@ class LiveByHand:
             store.add(copy.deepcopy(self._check).finish())
         imu = store.samples()
         if imu is None or len(imu) < 3:
-            raise NotObservableError(f'calibration by hand needs {POSES_LEAST} different attitudes held still, no sample came yet; '
+            raise NotObservableError(f'calibration by hand needs {POSES_LEAST} different attitudes at rest, no sample was received; '
                                      'check the topic', code='no_samples')
         self._search(store)
         recording = HandRecording(imu, None, self.counts)
@@ -241,5 +241,5 @@ def _check_model(model):
     thermal = [effect.name for effect in model.effects if 'temperature' in effect.needs]
     if thermal:
         raise InputError(f"{', '.join(thermal)} must be estimated by hand from a recording, live no temperatures are kept; "
-                         "record a bag and run 'imu_calibration calibrate BAG', or leave it out", code='offline_only')
+                         "record a bag and run 'imu_calibration calibrate BAG', or omit it", code='offline_only')
     HandModel(model, STANDARD_GRAVITY)

@@ -64,8 +64,8 @@ class HandModel:
         """Refuse what cannot be seen by hand."""
         strange = [e.name for e in self.model.further if not possible_by_hand(e)]
         if strange:
-            raise InputError('calibration by hand knows gravity and the turns between poses, '
-                             f'{", ".join(strange)} cannot be seen from them; give a table, or leave it out', key='table',
+            raise InputError('the reference by hand is gravity and the turns between poses, '
+                             f'{", ".join(strange)} cannot be estimated from it; give a table, or omit it', key='table',
                              code='table_needed')
 
     @cached_property

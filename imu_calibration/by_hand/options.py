@@ -80,7 +80,7 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
 
     """
     if options.noise is not None:
-        raise InputError('noise that was measured apart weighs the windows of a table; by hand it must be left out', key='table',
+        raise InputError('a separate noise file is for tables only; by hand it must be omitted', key='table',
                          code='table_only')
     asked = (options.accelerometer_model, options.gyroscope_model)
     accelerometer, gyroscope = (None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)

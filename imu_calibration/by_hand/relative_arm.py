@@ -201,6 +201,6 @@ def _require_seen(seen, sd):
     direction = directions[:, np.argmin(shares)]
     worst = int(np.argmax(np.abs(direction))) if shares.min() < 0.5 else int(np.argmax(np.where(np.isfinite(sd), sd, np.inf)))
     if shares.min() < 0.5 or not np.all(sd < 0.5 * ARM_PRIOR):
-        raise NotObservableError(f'the motion must show the whole arm, along {"xyz"[worst]} only {max(shares.min(), 0):.0%} of what '
-                                 f'it shows is not noise and the sd is {np.max(sd):.2g} m; '
-                                 f'twist fast about the axes other than {"xyz"[worst]} too', code='arm_not_observable')
+        raise NotObservableError(f'the motion must show the whole arm, along {"xyz"[worst]} only {max(shares.min(), 0):.0%} of the '
+                                 f'signal is not noise and the sd is {np.max(sd):.2g} m; '
+                                 f'rotate fast also about the axes perpendicular to {"xyz"[worst]}', code='arm_not_observable')

@@ -106,7 +106,7 @@ def fit_arm(rows: ArmRows) -> Fit:
     try:
         seen = scipy.linalg.eigh(_reduced(normal), _reduced(raw))
     except np.linalg.LinAlgError as error:
-        raise NotObservableError('the motion must show the whole arm, it leaves a direction without any sign; '
+        raise NotObservableError('the motion must show the whole arm, one direction has no signal; '
                                  'twist fast about all axes') from error
     partial = Fit(values, design, rows.difference - design @ values, weights, weight_fall, normal, seen)
     hessian = partial.curvature(slice(None)) + (normal - raw)

@@ -121,7 +121,7 @@ class HandStore:
         try:
             with load_arrays(data) as arrays:
                 if str(arrays['format']) != FORMAT:
-                    raise DocumentError(f"saved samples must say '{FORMAT}', got '{arrays['format']}'; remove the file, or start "
+                    raise DocumentError(f"samples must have the format '{FORMAT}', got '{arrays['format']}'; remove the file, or start "
                                         'without resume')
                 imu = ImuSamples(arrays['stamp_ns'], arrays['force_s'], arrays['rate_s'], str(arrays['frame_id']))
             for values, kind, shape in ((imu.stamp_ns, 'i', ()), (imu.force_s, 'f', (3,)), (imu.rate_s, 'f', (3,))):

@@ -87,7 +87,7 @@ def hand_status(found: Findings, calibration: Calibration | None, *, gravity_unk
         parts.append('turns left out: ' + ', '.join(f'{count} {reason}' for reason, count in sorted(found.dropped.items())))
     if found.resting:
         parts.append(f'at rest for {found.resting:.1f} s: this pose counts, move on')
-    parts += [f'next: {need}' for need in needs] if needs else ['everything is determined: save it']
+    parts += [f'next: {need}' for need in needs] if needs else ['all parameters are determined: save the calibration']
     return SessionStatus(word, '; '.join(parts), values)
 
 
@@ -103,7 +103,7 @@ def unseen(found: Findings) -> list[str]:
 def _needs(found, not_seen, calibration, *, gravity_unknown, step, hints):
     if found.attitudes < POSES_LEAST or calibration is None:
         more = f' (faces not seen yet: {", ".join(not_seen)})' if not_seen else ''
-        return Progress.WAITING, [f'{step}{more}; {POSES_LEAST} attitudes at least, {POSES_FULL} for everything']
+        return Progress.WAITING, [f'{step}{more}; {POSES_LEAST} attitudes at least, {POSES_FULL} for all parameters']
     lacking = [name for name, status in zip(calibration.param_names, calibration.status) if status != DETERMINED]
     if not lacking:
         return Progress.DETERMINED, []

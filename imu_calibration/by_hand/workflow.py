@@ -100,7 +100,7 @@ def calibrate_without_table(sources: Sequence[Callable], options: CalibrationOpt
 
     """
     if len(sources) != 1:
-        raise InputError(f'calibration by hand takes one recording, {len(sources)} came; calibrate them one by one and compare the results')
+        raise InputError(f'calibration by hand needs one recording, got {len(sources)}; calibrate them separately and compare the results')
     preflight = Preflight(options.gravity)
     recording = read_by_hand(sources[0](), options.nominal, [preflight])
     return calibrate_samples_by_hand(recording, options, provenance, findings=preflight.findings)

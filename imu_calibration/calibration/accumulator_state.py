@@ -104,14 +104,14 @@ def _reading(data):
         with load_arrays(data) as arrays:
             header = json.loads(bytes(arrays['header']).decode())
             if header.get('format') != FORMAT:
-                raise DocumentError(f"a saved accumulator must say '{FORMAT}', got {shortened(repr(header.get('format')))}; remove "
+                raise DocumentError(f"an accumulator must have the format '{FORMAT}', got {shortened(repr(header.get('format')))}; remove "
                                     'the file')
             yield header, arrays
     except ImuCalibrationError:
         raise
     except Exception as error:   # damaged archives, arrays and headers raise many kinds
-        raise DocumentError(f'a saved accumulator must be a whole file of {FORMAT}, this file of {len(data)} bytes is damaged or of '
-                            f'another kind ({shortened(str(error), 200)}); remove the file', code='accumulator_damaged') from error
+        raise DocumentError(f'a saved accumulator must be a whole file of {FORMAT}, this file of {len(data)} bytes is damaged or has '
+                            f'a different format ({shortened(str(error), 200)}); remove the file', code='accumulator_damaged') from error
 
 
 def saved_model(data: bytes) -> SensorModel:
@@ -136,8 +136,8 @@ def _model(header):
 def _check(header, model):
     known = _model(header)
     if not known.has_columns_of(model):
-        raise DocumentError(f'a saved accumulator must hold the columns of the model that is asked for, it holds {_text(known)}, '
-                            f'asked for is {_text(model)}; start without resume, or with the old model', code='other_model')
+        raise DocumentError(f'a saved accumulator must contain the columns of the requested model, it has {_text(known)}, '
+                            f'requested is {_text(model)}; start without resume, or with the old model', code='other_model')
 
 
 def _text(model):

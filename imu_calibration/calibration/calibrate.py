@@ -119,7 +119,7 @@ def _first_temperature(sources):
     for block in sources[0]():
         if block.temperature is not None and len(block.temperature):
             return float(block.temperature.temperature_c[0])
-    raise InputError('a thermal effect needs temperatures, the recording has none; record imu/temperature or leave the effect out')
+    raise InputError('a thermal effect needs temperatures, the recording has none; record imu/temperature or omit the effect')
 
 
 def solve_gathered(gathered: Gathered, model: SensorModel, options: CalibrationOptions = CalibrationOptions()) -> Solution:

@@ -85,11 +85,11 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     linear = {'.'.join(effect.key) for effect in first.model.effects if effect.role == Role.LINEAR}
     if rejected & linear and 'mount' in (first.gauge.get('axes'), second.gauge.get('axes')):
         lines.append('off-diagonal terms of a matrix include how the IMU was mounted on the table: '
-                     'mounted anew they differ without a change of the IMU')
+                     'they differ after remounting without a change of the IMU')
     if held.any():
         lines.append(f'{int(held.sum())} parameters are held in one of them and were not compared')
     if len(parts) < 2:
-        lines.append('whether the calibrations agree cannot be told: the uncertainties of imported values are not known')
+        lines.append('agreement of the calibrations cannot be tested: the uncertainties of imported values are unknown')
         return Comparison(rows, None, tuple(lines))
     lines.append('the calibrations disagree' if rejected else 'the calibrations agree')
     return Comparison(rows, not rejected, tuple(lines))

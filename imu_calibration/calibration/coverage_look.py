@@ -27,6 +27,6 @@ def cells_of(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...]
 def line_of(coverage: Coverage) -> str:
     """Return the one line that stands beside the sphere."""
     if coverage.done:
-        return 'everything is determined: save it'
+        return 'all parameters are determined: save the calibration'
     what = coverage.next.text or 'go on'
     return what + ('' if np.isnan(coverage.seconds) or not coverage.seconds else f', about {coverage.seconds:.0f} s left')

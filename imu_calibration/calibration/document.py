@@ -185,8 +185,8 @@ def checked_tolerances(mapping: Any, catalogue: Catalogue = CATALOGUE) -> dict[s
                              f'{shortened(repr(entries))}; correct it', code='tolerance_section')
         for name, value in entries.items():
             if name not in known[section]:
-                raise InputError(f'a tolerance must be of an effect of the {section}, {shortened(repr(name))} is none; '
-                                 f'those are {", ".join(known[section])}', code='tolerance_name')
+                raise InputError(f'a tolerance must be of an effect of the {section}, {shortened(repr(name))} is not one; '
+                                 f'its effects are {", ".join(known[section])}', code='tolerance_name')
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < np.inf:
                 raise InputError(f"the tolerance of '{name}' must be a number above zero, got {shortened(repr(value))}; correct it")
     return mapping
@@ -275,7 +275,7 @@ def _one_line(error):
 def _check_format(found):
     name, _, number = str(found).partition('/')
     if name != 'imu_calibration' or not number.isdigit():
-        raise DocumentError(f"a calibration document must say 'format: {FORMAT}', got {shortened(repr(found))}; "
+        raise DocumentError(f"a calibration document must have 'format: {FORMAT}', got {shortened(repr(found))}; "
                             "give a file written by 'imu_calibration calibrate'", code='document_format')
     if int(number) > int(FORMAT.partition('/')[2]):
         raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got {shortened(repr(found))}; "

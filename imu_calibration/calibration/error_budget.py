@@ -37,7 +37,7 @@ class ReferenceErrors:
 
     levelling: float = setting(2 * ARCMIN, 'rad', 'levelling of the table, each of two directions; counts when table_tilt is not estimated',
                                (0.0, 0.1))
-    joint_position: float = setting(10 * ARCMIN / 60, 'rad', 'position of each joint, drawn anew in every window', (0.0, 0.1))
+    joint_position: float = setting(10 * ARCMIN / 60, 'rad', 'position of each joint, independent in every window', (0.0, 0.1))
     rate: float = setting(1e-4, '1', 'relative error of the table rate (its clock), common to all windows', (0.0, 0.1))
     gravity: float = setting(5e-4, 'm/s^2',
                              'local gravity, if the table description gives gravity without gravity_sd',
@@ -94,7 +94,7 @@ def _causes(result, errors, gravity_sd):
     if result.solution.model.find('reference', Role.TILT) is None:
         text = f'levelling {errors.levelling / ARCMIN:.2g} arcmin in each direction, not estimated'
         found.append(('levelling', text, False, [_Tilted(errors.levelling * np.eye(2)[k]) for k in range(2)]))
-    text = f'joint positions {errors.joint_position / ARCMIN * 60:.2g} arcsec, drawn anew in every window'
+    text = f'joint positions {errors.joint_position / ARCMIN * 60:.2g} arcsec, independent in every window'
     found.append(('joint position', text, True, [_Turned(errors.joint_position, k) for k in range(len(result.table.joints))]))
     found.append(('table rate', f'rate wrong by {errors.rate:.2g} of itself in all windows', False, [_Faster(errors.rate)]))
     found.append(('gravity', f'gravity known to {gravity_sd:.2g} m/s²', False, [_Heavier(gravity_sd)]))

@@ -149,8 +149,8 @@ def join(parts: Sequence[Gathered], names: Sequence[str], check: Callable[[Gathe
 
 def _require_like_the_first(first, part, first_name, name):
     if not part.accumulator.rows:
-        raise InputError(f'{name}: every recording must hold a static window, spin or dynamic stretch, this one has none; leave it out')
+        raise InputError(f'{name}: every recording must contain a static window, spin or dynamic segment, this one has none; omit it')
     if part.frame_id != first.frame_id:
-        raise InputError(f"{name}: all recordings must come from one IMU, "
+        raise InputError(f"{name}: all recordings must be of one IMU, "
                          f"the frame is '{part.frame_id}' here and '{first.frame_id}' in {first_name}; "
                          'calibrate different IMUs one by one')

@@ -237,7 +237,7 @@ class LiveCalibration:
 
     def _begun(self) -> LiveCollector:
         if self._collector is None:
-            raise InputError('a thermal effect needs temperatures, none came yet; publish imu/temperature or leave the effect out',
+            raise InputError('a thermal effect needs temperatures, none were received; publish imu/temperature or omit the effect',
                              code='temperature_missing')
         return self._collector
 

@@ -7,7 +7,7 @@ from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.effects.base import Role
 from imu_calibration.units import significant
 
-LOOK_FOR = {'reference': 'such tables are known for: look for a wrong description of the table, a loose mount, wrong stamps'}
+LOOK_FOR = {'reference': 'the literature values of tables: check the description of the table, the mount, the stamps'}
 
 ONE = 3.0
 """Standard deviations by which one coefficient of an effect must differ from its prior for the effect to be added."""
@@ -42,8 +42,8 @@ def beyond_instruments(calibration: Calibration, sensor: str) -> str:
 
 def beyond_known(share: float, section: str) -> str:
     """Return what is said of an effect that explains a share of the rest with a size that is known of no instrument."""
-    return (f'explains {100 * share:.0f} % of what the model leaves, but its size is beyond what '
-            f'{LOOK_FOR.get(section, "such sensors are known for: look for saturation, a loose mount, a wrong scale")}')
+    return (f'explains {100 * share:.0f} % of the residual, but its size exceeds '
+            f'{LOOK_FOR.get(section, "the literature values of such sensors: check saturation, the mount, the scale")}')
 
 
 def implausible(calibration: Calibration, sensor: str | None = None) -> list[str]:
@@ -57,5 +57,5 @@ def implausible(calibration: Calibration, sensor: str | None = None) -> list[str
             grade, largest, source = effect.plausible[-1]
             size = max(map(abs, amplitudes))
             lines.append(f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, '
-                         f'more than ten times what is known of {grade} instruments ({largest:.3g}; {source}): check units and axes')
+                         f'more than ten times the known values of {grade} instruments ({largest:.3g}; {source}): check units and axes')
     return lines

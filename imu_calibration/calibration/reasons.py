@@ -60,7 +60,7 @@ def quiet(calibration: Calibration) -> str:
 
     Without a rest only their own slow part is there, and lags show in the fast one.
     """
-    return 'the noise at rest' if rested(calibration) else 'their slow part (a lag or a late clock leaves that)'
+    return 'the noise at rest' if rested(calibration) else 'their slow part (as after a lag or a late clock)'
 
 
 def rested(calibration: Calibration) -> bool:

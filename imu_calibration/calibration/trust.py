@@ -74,7 +74,7 @@ def refused_sensors(calibration: Calibration, *, anyway: bool = False, live: boo
         if why := beyond_instruments(calibration, sensor) or (live and _mostly_undetermined(calibration, sensor)):
             refused[sensor] = why
     if 'accelerometer' in refused and calibration.gauge.get('axes') == HAND_AXES:
-        refused.setdefault('gyroscope', 'its axes are those of the accelerometer')
+        refused.setdefault('gyroscope', 'its axes depend on the accelerometer')
     return refused
 
 
@@ -98,7 +98,7 @@ def usage(calibration: Calibration) -> str:
     if len(refused) != 1:
         return 'compensation corrects neither sensor with it' if refused else ''
     corrected = next(s for s in SENSORS if s not in refused)
-    return f'compensation corrects the {corrected} with it, and leaves the {next(iter(refused))} unchanged'
+    return f'compensation corrects the {corrected} with it; the {next(iter(refused))} is unchanged'
 
 
 def caveats(calibration: Calibration) -> list[str]:

@@ -169,7 +169,7 @@ def _strange_causes(calibration):
     catalogue = {effect.name: effect.sensor for effect in calibration.model.catalogue.effects(calibration.model.joint_names).values()}
     return [Reason(WARNING, f'{name} {beyond_known(share, catalogue.get(name, ""))}; '
                    'it is not in the model, and the standard deviations allow for it',
-                   f"see 'imu_calibration diagnose'; where {name} is what you expect, "
+                   f"see 'imu_calibration diagnose'; if {name} is expected, "
                    "name it in the model", sensors=_whose([catalogue.get(name, '')]))
             for name, share in found.items()]
 

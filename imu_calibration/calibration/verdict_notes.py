@@ -44,7 +44,7 @@ def _adopted(calibration):
     added, denied = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
     notes = [Reason(NOTE, 'added to the model, because the recording demands it: '
                     f'{", ".join(_with_size(calibration, name) for name in added)}',
-                    "see 'imu_calibration diagnose' for the evidence; the model as asked leaves it out")] if added else []
+                    "see 'imu_calibration diagnose' for the evidence; the requested model omits it")] if added else []
     notes += [Reason(NOTE, f'not added to the model, because parts of the recording disagree, no coefficient is significant or the size is '
                     f'implausible: {", ".join(denied)}; the standard deviations allow for it',
                      "see 'imu_calibration diagnose'")] if denied else []
@@ -52,7 +52,7 @@ def _adopted(calibration):
     notes += [Reason(NOTE, f'the motion demands {", ".join(lacking)}, which cannot join the model, since not all of it is kept: '
                      'the standard deviations allow for it', 'calibrate the recording offline')] if lacking else []
     strange = calibration.statistics.get('not_believed') or {}
-    return notes + ([Reason(NOTE, 'held, because only what the model misses gives them a value, and one that no sensor has: '
+    return notes + ([Reason(NOTE, 'held, because only the misfit of the model determines them, at an implausible value: '
                             f'{_strange(strange)}',
                             'move the table so that gravity or the rate of turn act along their axes')] if strange else [])
 
@@ -102,11 +102,11 @@ def _left_out(calibration):
     for sensor in SENSORS:
         times = (calibration.statistics.get(sensor) or {}).get('left_out_s') or []
         if times:
-            windows = ('a window, whose mean the others contradict' if len(times) == 1
-                       else f'{len(times)} windows, whose means the others contradict')
+            windows = ('a window, whose mean is an outlier' if len(times) == 1
+                       else f'{len(times)} windows, whose means are outliers')
             notes.append(Reason(NOTE, f'left out of the {sensor}: {windows}, '
                                 f'at {", ".join(f"{time:.0f} s" for time in times[:SHOWN_NAMES])}'
-                                      + (' ...' if len(times) > SHOWN_NAMES else ''), 'somebody may have touched the table or the IMU'))
+                                      + (' ...' if len(times) > SHOWN_NAMES else ''), 'the table or the IMU may have been touched'))
     return notes
 
 
@@ -117,4 +117,4 @@ def _lost(calibration):
     total, used = sum(dropped.values()), sum((calibration.statistics.get('samples_used') or {}).values())
     text = 'dropped: ' + ', '.join(f'{count} {reason}' for reason, count in dropped.items())
     many = total > LOST_SHARE * max(used, 1)
-    return [Reason(NOTE, text, "look at the recording with 'imu_calibration inspect'" if many else '')]
+    return [Reason(NOTE, text, "check the recording with 'imu_calibration inspect'" if many else '')]

@@ -30,10 +30,10 @@ def run(options: Namespace) -> VerbResult:
         return VerbResult(0, {'targets': _show_targets()})
     for name, given in (('CALIBRATION', options.document), ('--to NAME', options.to), ('--output FILE', options.output)):
         if not given:
-            raise InputError(f'an export must have {name}, none came; give it, or see --list')
+            raise InputError(f'an export must have {name}, none was given; give it, or see --list')
     stand = stand_of(options)
     if stand is not None and not options.bag:
-        raise InputError('a table or arm says how a recording moved and must come with --bag BAG, none came; give both')
+        raise InputError('a table or arm needs the recording --bag BAG, none was given; give both')
     from imu_calibration.use_cases.exporting import export_calibration
     from imu_calibration.use_cases.recordings import Topics
     topics = Topics(options.imu_topic, options.joint_topic, options.temperature_topic, options.frame_id)

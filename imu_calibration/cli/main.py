@@ -58,5 +58,5 @@ def run(options: Namespace) -> int:
 
 
 def _interrupted(prog):
-    print(f'{prog}: interrupted; nothing was written', file=sys.stderr)
+    print(f'{prog}: interrupted; no file was written', file=sys.stderr)
     return 130

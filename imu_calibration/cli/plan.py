@@ -90,7 +90,7 @@ def _stand(options):
         return yaw_table(options.gravity)
     stand = stand_of(options)
     if stand is None:
-        raise InputError('what moves the IMU must be described, nothing was; give a table or a robot description', key='table')
+        raise InputError('a table or a robot description is required, none was given; give one', key='table')
     return stand
 
 

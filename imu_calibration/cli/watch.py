@@ -49,7 +49,7 @@ def _watch(watcher, options):
         watcher.spin(PERIOD)
     if not watcher.statuses:
         others = f' (heard: {", ".join(sorted(watcher.others))})' if watcher.others else ''
-        raise InputError(f"'{options.node}' must run, nothing came of it on /diagnostics in {options.patience:g} s; start it, or name it "
+        raise InputError(f"'{options.node}' must run, no message on /diagnostics in {options.patience:g} s; start it, or name it "
                          f'with --node, as `ros2 node list` shows it{others}')
     out = console()
     if options.once or options.json:

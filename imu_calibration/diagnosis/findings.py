@@ -45,7 +45,7 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
         parameters = fitted(search, named, question)
     text = sentence(question.effect, parameters, gain)
     if score.implausible:
-        text += f' It {beyond_known(explained, question.sensor)}. It is in no model unless asked for.'
+        text += f' It {beyond_known(explained, question.sensor)}. It is in no model unless requested.'
     mates = [*rivals, *(mate for mate, _ in search.class_mates(named, question)
                         if mate.name not in {rival.name for rival in rivals} and shows(place, mate, gain))]
     return Finding(question.name, question.sensor, text, parameters, score.p_value, score.gain, explained, gain,

@@ -45,7 +45,7 @@ class DiagnosisState:
 
     word: Outcome = WAITING
     """What it came to."""
-    message: str = f'it is asked after a solution, once there are {LEAST_WINDOWS} windows'
+    message: str = f'it follows a solution of at least {LEAST_WINDOWS} windows'
     """One line."""
     values: dict = field(default_factory=dict)
     """Figures by name."""
@@ -101,7 +101,7 @@ def describe(diagnosis: Diagnosis) -> DiagnosisState:
     message = f'{first.title}: {first.explanation}'
     if first.indistinguishable_from:
         others = ', '.join(first.indistinguishable_from)
-        message += f' This motion cannot tell it from {others}; to separate them: {first.separating_motion}'
+        message += f' This motion does not separate it from {others}; a motion that does: {first.separating_motion}'
     low, high = first.gain.ci95
     values = {'effect': first.effect, 'sensor': first.sensor, 'explanation': first.explanation,
               **{name: f'{value:.4g} +- {sd:.2g} {unit}' for name, (value, sd, unit) in first.parameters.items()},

@@ -10,7 +10,7 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import FAMILY_WISE, Score, Search
 from imu_calibration.units import for_people, with_sd
 
-LEAVES_MOST = 'refused: it leaves most of the unexplained where it was'
+LEAVES_MOST = 'rejected: most of the residual would remain'
 """Verdict on an effect that is significant, but removes too small a share."""
 DISAGREED = 'refused: the windows do not agree on it'
 """Verdict on an effect whose evidence is that of few windows, or of some against others."""
@@ -41,7 +41,7 @@ def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], ga
         size = f'known here in combinations only, none of its values by itself: {size}'
     if n_clipped is not None:
         limit = _with_unit(f'{value * factor:.4g}', unit)
-        return f'{effect.explanation} The limit is {limit}; {n_clipped} samples at it and those close to it were excluded.'
+        return f'{effect.explanation} The limit is {limit}; {n_clipped} samples at it and neighbouring samples were excluded.'
     which = '' if len(values) == 1 else f' (largest: {label})'
     text = f'{effect.explanation} Its size is {size}{which}.'
     if gain is not None and gain.reduction > 0:
@@ -83,7 +83,7 @@ def candidates_of(search: Search, named: Sequence[Question], *, agree: Callable[
 
 def verdict_of(name: str, alone: Score, beside: Score | None, *, found: Collection[str], mates: dict[str, Any]) -> str:
     """
-    Return 'found', 'as good as NAME', 'not needed beside the findings', 'no evidence', or why the effect was refused.
+    Return 'found', 'as good as NAME', 'not needed in addition to the findings', 'no evidence', or why the effect was refused.
 
     Parameters
     ----------
@@ -106,5 +106,5 @@ def verdict_of(name: str, alone: Score, beside: Score | None, *, found: Collecti
     if beside is not None and beside.significant:
         return LEAVES_MOST
     if alone.significant:
-        return 'not needed beside the findings' if found else LEAVES_MOST
+        return 'not needed in addition to the findings' if found else LEAVES_MOST
     return 'no evidence'

@@ -138,5 +138,5 @@ def _check(effect, taken):
         raise InputError(f"effect '{effect.name}' must belong to {', '.join(SECTIONS)}, got '{effect.sensor}'; correct it")
     strange = {quantity for group in effect.groups for quantity in group.uses} - UNDONE_WITH
     if effect.compensation == 'exact' and strange:
-        raise InputError(f"effect '{effect.name}' must do without {', '.join(sorted(strange))}, which compensation does not know; "
+        raise InputError(f"effect '{effect.name}' must not use {', '.join(sorted(strange))}, which are unknown during compensation; "
                          "declare it with compensation 'none'", code='time_unavailable')

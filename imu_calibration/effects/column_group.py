@@ -86,7 +86,7 @@ class ColumnGroup:
         try:
             values = {name: getattr(ref, field)[index] for name, field, index in self._places}
         except IndexError as error:
-            raise InputError(f"the columns of '{self.name}' speak of more joints than there are: {', '.join(self.text)}; "
+            raise InputError(f"the columns of '{self.name}' refer to more joints than exist: {', '.join(self.text)}; "
                              "correct them") from error
         values['temperature_ref_c'] = np.float64(point.get('temperature_ref_c', 25.0))
         result, count = np.empty((len(ref), self.width)), len(self.text)
@@ -100,9 +100,9 @@ class ColumnGroup:
         if self.name in point.get('centre', ()):
             result -= point['centre'][self.name]
         if self._may_fail and not np.all(np.isfinite(result)):
-            raise InputError(f"the columns of '{self.name}' must be finite wherever the recording goes, {', '.join(self.text)} is not; "
-                             "divide by nothing that "
-                             'passes through zero, and take no root or logarithm of what may be negative', code='column_not_finite')
+            raise InputError(f"the columns of '{self.name}' must be finite in the whole recording, {', '.join(self.text)} is not; "
+                             "do not divide by a quantity that "
+                             'passes through zero, and use no root or logarithm of a negative quantity', code='column_not_finite')
         return result
 
     def products(self, known: dict[str, Sum]) -> list[Sum]:

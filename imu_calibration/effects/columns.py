@@ -87,7 +87,7 @@ def columns(model: SensorModel, sensor: str, table: Table, *, motion: JointMotio
     references = references or References(model, table, motion, temperature_c=temperature_c)
     ref, layout, parts = references.at(sensor), model.layout(sensor), []
     if ref.temperature_c is None and any('temperature' in group.uses for group in layout.groups.values()):
-        raise InputError('a thermal effect needs temperatures, none came; record imu/temperature or leave the effect out')
+        raise InputError('a thermal effect needs temperatures, none were received; record imu/temperature or omit the effect')
     warps = {WARP + e.name: e for e in layout.effects if e.warp is not None}
     for name in layout.rows:
         if name in warps:

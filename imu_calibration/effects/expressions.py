@@ -109,7 +109,7 @@ def _checked(node, text, depth):
         case ast.BinOp(left=left, op=op, right=right) if isinstance(op, OPERATORS):
             if isinstance(op, ast.Pow):
                 if not (isinstance(right, ast.Constant) and type(right.value) is int and 0 <= right.value <= HIGHEST_POWER):
-                    raise _Refused(right.col_offset, f'a power that is not a whole number up to {HIGHEST_POWER}')
+                    raise _Refused(right.col_offset, f'a power that is not an integer up to {HIGHEST_POWER}')
                 return _folded(ast.BinOp(inner(left), op, right), node)
             return _folded(ast.BinOp(inner(left), op, inner(right)), node)
         case ast.UnaryOp(op=op, operand=operand) if isinstance(op, SIGNS):
@@ -122,7 +122,7 @@ def _checked(node, text, depth):
             raise _Refused(node.col_offset, f"the unknown name '{name[:30]}'")
         case ast.Constant(value=value) if type(value) in (int, float) and abs(value) < LARGEST:
             return ast.copy_location(ast.Constant(float(value)), node)
-    raise _Refused(node.col_offset, 'something else than arithmetic')
+    raise _Refused(node.col_offset, 'an operation that is not arithmetic')
 
 
 def _folded(node, source):

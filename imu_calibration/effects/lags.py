@@ -30,11 +30,11 @@ def _second_order():
 
 SECOND_ORDER = _second_order()
 _KINDS = {
-    'bandwidth': ('time_constant', FIRST_ORDER, 'answers through a first-order low-pass filter: '
-                  'its output lags and loses amplitude at speed'),
+    'bandwidth': ('time_constant', FIRST_ORDER, 'has a first-order low-pass filter: '
+                  'its output has a lag and a smaller amplitude at high frequency'),
     'delay': ('delay', ((1.0, 1.0),), 'sends its output late, and the other sensor does not: a pure delay of its own'),
-    'filter': ('delay', SECOND_ORDER, 'answers through a second-order (Butterworth) low-pass filter: its output lags, '
-               'and keeps its amplitude up to near its edge'),
+    'filter': ('delay', SECOND_ORDER, 'has a second-order (Butterworth) low-pass filter: its output has a lag, '
+               'and an unchanged amplitude up to near its edge'),
 }
 """Ending of the name -> (component, (weight, delay) pairs, what the sensor does). All have the same first derivative."""
 

@@ -96,7 +96,7 @@ def _earth_known(table):
     if table.azimuth_deg is None:
         return None
     return ('the reference holds the rotation of the Earth already, from latitude and azimuth',
-            'leave the azimuth out of the table description')
+            'omit the azimuth in the table description')
 
 
 def _bent(values, point):
@@ -124,25 +124,25 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
     return (
         Effect(
             **of_table, name='table_tilt', role=Role.TILT, components=('x', 'y'), shape=(2,),
-            explanation='The table does not stand level: its vertical is turned by a small angle about the base axes.',
+            explanation='The table is not level: its vertical is rotated by a small angle about the base axes.',
             tolerance_reason='0.1 mg at 1 g, a tenth of the accelerometer bias', prior_sd=2e-3,
             plausible=(('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),), motion=('turn_about_vertical',),
             warp=_tilt, derivative=_tilt_derivative, acts_on=('accelerometer',), needs=('joints',)),
         Effect(
             **of_table, name='axis_non_orthogonality', components=names.angles, shape=(len(names.angles),),
-            explanation='The axes of the table do not stand at the angles to one another that its description says.',
+            explanation='The angles between the axes of the table differ from its description.',
             tolerance_reason='as the tilt', prior_sd=names.angle_sd or 0.01,
             plausible=(('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),),
             motion=('two_axis', 'static_dense'), warp=_axes, needs=('joints', 'two_joints')),
         Effect(
             **of_table, name='encoder_zero', components=names.zeros, shape=(len(names.zeros),),
-            explanation='The zero of an inner joint angle is not where the table description says.',
+            explanation='The zero of an inner joint angle differs from the table description.',
             tolerance_reason='as the tilt', prior_sd=names.angle_sd or 0.01,
             plausible=(('bench', 0.02, 'field catalogue 6.3: encoder zero, up to degrees'),),
             motion=('static_dense',), warp=_zero, needs=('joints', 'three_joints')),
         Effect(
             **of_table | {'unit': 'm'}, name='axis_offset', components=names.places, shape=(len(names.places),),
-            explanation='The axes do not pass through the points that the description says.',
+            explanation='The axes do not pass through the points of the description.',
             tolerance_reason='0.1 mm, 0.01 m/s^2 at 10 rad/s', prior_sd=names.place_sd or 1e-3,
             plausible=(('arm', 0.01, 'lengths of arms: 0.1-1 mm after a calibration of their own'),), motion=('two_axis', 'three_speeds'),
             warp=_places, acts_on=('accelerometer',), needs=('joints', 'two_joints', 'dynamic')),
@@ -154,8 +154,8 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             motion=('slow_turn',), warp=_harmonics, needs=('joints',)),
         Effect(
             **of_table, name='axis_sag', components=names.turning[1:], shape=(len(names.turning[1:]),),
-            explanation='The axes sag: each hangs towards the ground by an angle that goes with how level it lies, '
-            'as a loaded shaft bends.',
+            explanation='The axes sag: each bends towards the ground by an angle proportional to its horizontal component, '
+            'like a loaded shaft.',
             tolerance_reason='as the tilt', prior_sd=2e-3,
             plausible=(('bench', 3e-3, 'field catalogue 6.3: arcsec to 10 arcmin of a slender shaft'),),
             motion=('static_dense', 'two_axis'), warp=_sag, needs=('joints', 'two_joints')),
@@ -183,7 +183,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
         Effect(
             name='earth_rate', sensor='reference', components=('x', 'y', 'z'), shape=(3,), unit='rad/s', nuisance=True,
             title='Earth rate in the level frame', known_size=True, moot=_earth_known,
-            explanation="The gyroscopes feel the Earth's rotation, which the model leaves out.",
+            explanation="The gyroscopes measure the Earth's rotation, which the model omits.",
             tolerance=2e-6, tolerance_reason="3 % of the Earth's rotation", prior_sd=1e-4,
             plausible=(('Earth', 7.3e-5, 'WGS 84: 7.292115e-5 rad/s'),),
             motion=('turn_about_vertical', 'static_poses'), compensation='none', groups=(ATTITUDE,), coefficients=_earth,

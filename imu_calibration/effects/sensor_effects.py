@@ -81,7 +81,7 @@ def _pair(sensor):
         Effect(
             name=f'{short}_thermal_hysteresis', sensor=sensor, components=VECTOR, shape=(3,), unit=unit, against=('temperature',),
             smooth=True,
-            explanation=f'The {sensor} bias depends on which way the temperature came: cooling it takes another branch than warming up, '
+            explanation=f'The {sensor} bias depends on the thermal branch: the branches of cooling and warming differ '
             'by twice this.',
             tolerance=small, tolerance_reason='as the bias', prior_sd=20 * small,
             plausible=(('consumer', 5 * MILLI_G if accel else 0.1 * DEG, 'as much as the thermal bias over some kelvins'),),
@@ -90,7 +90,7 @@ def _pair(sensor):
         Effect(
             name=f'{short}_vibration_rectification', sensor=sensor, components=VECTOR if accel else MATRIX, shape=(3,) if accel else (3, 3),
             unit=f'{unit}/(m/s^2)^2', against=('time',),
-            explanation=f'The {sensor} bias shifts with vibration: what is even in its elements makes a mean of it, '
+            explanation=f'The {sensor} bias shifts with vibration: even terms of its response rectify it, '
             + ('along the axis of each' if accel else 'of each direction') + ', by this for each variance that is left in the band.',
             tolerance=small / SHAKEN, tolerance_reason=f'as the bias, at a vibration of {np.sqrt(SHAKEN):.2g} m/s^2 rms',
             prior_sd=100 * small / SHAKEN,
@@ -107,8 +107,8 @@ def _pair(sensor):
             groups=(own['THERMAL'],), coefficients=OfMatrix(f'{short}_thermal_scale', own['THERMAL'].name)),
         Effect(
             name=f'{short}_cross_axis_lag', sensor=sensor, components=OTHERS, shape=(3, 2), unit='s', against=('rate',),
-            explanation=f'Each {sensor} axis hears the others with another lag than its own: '
-            'what they feel comes onto it by how fast it changes.',
+            explanation=f'Each {sensor} axis has crosstalk of the remaining axes with a different lag: '
+            'its output contains their rate of change.',
             tolerance=1e-5, tolerance_reason='1 mrad of cross coupling through a lag of 10 ms', prior_sd=1e-3,
             plausible=(('consumer', 5e-4, '10 mrad of cross coupling through a lag of 50 ms'),),
             motion=('oscillate_fast', 'two_axis'), compensation='exact', needs=('rotation',), moot=_one_axis,
@@ -157,8 +157,8 @@ ACCELEROMETER = _pair('accelerometer') + (
     Effect(
         name='lever_arm', sensor='accelerometer', role=Role.ARM, components=VECTOR, shape=(3,), unit='m',
         title='lever arm of the triad (nuisance parameter)', in_reference=True, nuisance=True, contained_in='accel_size_effect',
-        explanation='The whole accelerometer triad sits beside the point where it was thought to be: one common lever arm.',
-        tolerance=1e-3, tolerance_reason='the same arm, for the triad as a whole', prior_sd=0.5,
+        explanation='The whole accelerometer triad is displaced from its assumed point: one common lever arm.',
+        tolerance=1e-3, tolerance_reason='the same arm, for the whole triad', prior_sd=0.5,
         plausible=(('consumer', 1.0, 'field catalogue 6.1: cm to dm'),), motion=('oscillate_x', 'oscillate_y', 'oscillate_z'),
         compensation='none', needs=('rotation',), groups=(regressors.LEVER,), coefficients=LeverArms('lever_arm')),
 )

@@ -9,7 +9,7 @@ HEAD = """\
 # Standard deviation up to which a parameter counts as determined; above it the parameter is called weak.
 # One number per effect, SI, for each of its components. Copy this file, change what your use needs, and pass it on:
 # the option tolerances of the command line, the parameter tolerances_file of calibration_node.
-# The reasons speak of a navigation-grade use of a MEMS or tactical IMU on a robot.
+# The reasons refer to navigation with a MEMS or tactical IMU on a robot.
 """
 COMMENT_AT = 35
 """Column at which the reasons begin."""

@@ -63,7 +63,7 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
     """
     if not accumulator.rows:
         raise NotObservableError('at least one static window, spin or dynamic stretch must be found, none was; '
-                                 'let the table rest between moves, or check the joint states', code='no_windows')
+                                 'rest the table between moves, or check the joint states', code='no_windows')
     prior = prior or make_prior(model)
     system = WeightedSystem(accumulator, model, prior)
     values, free = start(system), ~fixed_parameters(model)

@@ -13,7 +13,7 @@ REST, WAY = 5.0, 3.0
 """s; a rest, and what a table or a person takes from one to the next."""
 ALONG = 0.98
 """Cosine of the angle up to which a joint lies along a sensor axis."""
-OTHER_MOUNT = 'mount the IMU at another angle on the joint and record the same motion again, beside this recording'
+OTHER_MOUNT = 'mount the IMU at a different angle on the joint and record the same motion again, in addition to this recording'
 """What helps where one joint has shown what it can."""
 
 

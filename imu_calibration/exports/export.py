@@ -111,7 +111,7 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
         return None, []
     found = _noise_of(calibration, figures, rate)
     if found is None or (target.needs_walk and not found.walk_known):
-        lacks = 'noise with random walks' if target.needs_walk else 'noise, or the rate of the readings beside the calibration,'
+        lacks = 'noise with random walks' if target.needs_walk else 'noise, or the rate of the readings of the calibration,'
         if target.only_noise:
             raise InputError(f'for {target.title} there must be {lacks} and there is none; give a noise document', key='noise',
                              code='noise_missing')
@@ -175,8 +175,8 @@ def loss_lines(target: Target, loss: Loss) -> list[str]:
     """Return what is lost, a line each."""
     if target.only_noise:
         left = ', '.join(f'{sensor} {significant(value)} {UNIT[sensor]}' for sensor, value in loss.left.items())
-        beside = ' beside a constant bias' if target.estimates else ''
-        return ['takes no calibration: feed it compensated readings (compensator_node, or the verb compensate)',
+        beside = ' in addition to a constant bias' if target.estimates else ''
+        return ['accepts no calibration: use compensated readings (compensator_node, or the verb compensate)',
                 f'fed with raw readings it is left with an error of rms {left}{beside}, on {loss.motion}']
     lines = []
     if loss.estimated:
@@ -188,7 +188,7 @@ def loss_lines(target: Target, loss: Loss) -> list[str]:
         lines.append(f'{what}: {lost.effect.sensor} {lost.effect.name}, {significant(lost.rms)} {UNIT[lost.effect.sensor]} rms')
     for sensor in SENSORS:
         left = f'{significant(loss.left[sensor])} {UNIT[sensor]} rms' if loss.left[sensor] > NOTHING else 'none'
-        lines.append(f'error that this leaves in the {sensor}: {left} (raw readings: {significant(loss.raw[sensor])}), on {loss.motion}')
+        lines.append(f'remaining error of the {sensor}: {left} (raw readings: {significant(loss.raw[sensor])}), on {loss.motion}')
     return lines
 
 

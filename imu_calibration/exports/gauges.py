@@ -22,7 +22,7 @@ def lower_times_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     if np.linalg.det(matrix) <= 0:
         raise InputError('the axes of a sensor must be right-handed, the matrix of this calibration turns them into their mirror image; '
-                         'look for an exchanged axis', code='left_handed')
+                         'check for an exchanged axis', code='left_handed')
     q, r = np.linalg.qr(matrix.T)
     signs = np.sign(np.diag(r))
     return np.tril((r * signs[:, None]).T), (q * signs).T

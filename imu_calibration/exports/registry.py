@@ -46,6 +46,6 @@ def _find(name: str, fitting: list[Target], what: str) -> Target:
     for target in fitting:
         if target.name == name:
             return target
-    raise InputError(f"the name of a program whose files can be {what} must be given, got '{name}'"
+    raise InputError(f"the name of a program whose files can be {what} is required, got '{name}'"
                      f"{did_you_mean(name, (target.name for target in fitting))}; choose from "
                      f"{', '.join(target.name for target in fitting)}")

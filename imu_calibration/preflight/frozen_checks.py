@@ -23,13 +23,13 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         if constant.all():
             yield CheckFinding('frozen', REFUSE,
                                f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} samples; '
-                          'look at the sensor and its driver')
+                          'check the sensor and its driver')
             continue
         for axis in np.flatnonzero(constant):
             if noisy.any():
                 yield CheckFinding('frozen', REFUSE,
-                                   f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the other axes do; '
-                              'look at the sensor and its driver')
+                                   f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the remaining axes do; '
+                              'check the sensor and its driver')
         for axis in np.flatnonzero(~constant):
             moving = np.delete(range_[:, part], axis, axis=1) > MOVING * np.delete(evidence.resolution[part], axis)
             same = (range_[:, part][:, axis] == 0) & ~_at_end(chunks.mean[:, part][:, axis], evidence.ends[part][axis])
@@ -37,8 +37,8 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             if stuck.any():
                 seconds = stuck.sum() * float(np.median(chunks.duration))
                 yield CheckFinding('frozen', WARNING,
-                                   f'{sensor} {"xyz"[axis]} stands still for {seconds:.1f} s while other axes move; '
-                                   'look at its connection, and leave that time out', samples=int(stuck.sum() * chunks.size))
+                                   f'{sensor} {"xyz"[axis]} is constant for {seconds:.1f} s while different axes move; '
+                                   'check its connection, and exclude that time', samples=int(stuck.sum() * chunks.size))
 
 
 def _at_end(values, ends):
@@ -61,12 +61,12 @@ def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         spans.setdefault((part.start, part.stop) if part.who != 'joints' else 'joints', []).append(part)
     for together in spans.values():
         if together[0].who == 'joints':
-            text = ('joint states must follow the table, they stand still while the IMU turns, '
-                    f'{_spans(together)}; look at the driver of the table, or leave out the time in which the IMU was carried')
+            text = ('joint states must follow the table, they are constant while the IMU turns, '
+                    f'{_spans(together)}; check the driver of the table, or exclude the time in which the IMU was carried')
         else:
             who = 'IMU' if len(together) > 1 else together[0].who
             text = (f'the {who} must measure all the time, it repeats one reading {_spans(together[:1])}, which its noise does not allow; '
-                    'look at the sensor and its driver, and leave that time out')
+                    'check the sensor and its driver, and exclude that time')
         samples = together[0].samples if together[0].who != 'joints' else sum(part.samples for part in together)
         yield CheckFinding('frozen', WARNING, text, samples=samples)
 

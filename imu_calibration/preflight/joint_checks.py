@@ -110,15 +110,15 @@ def _rate_units(moments):
         return
     if 40 < ratio < 80:
         yield CheckFinding('rate_unit', REFUSE,
-                           f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: they look like deg/s; '
+                           f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: probably deg/s; '
                       'convert them in the driver or give a nominal scaling with gyroscope_scale 57.29578', key='nominal')
     elif 1 / 80 < ratio < 1 / 40:
         yield CheckFinding('rate_unit', REFUSE,
-                           f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: they look like '
+                           f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: probably '
                       'degrees; convert them in the driver of the table')
     elif not 0.5 < ratio < 2.0 and np.linalg.norm(cross)**2 > RELATED * np.trace(measured) * np.trace(reference) / 3:
         yield CheckFinding('rate_unit', REFUSE,
-                           f'angular rates must be in rad/s, they are {ratio:.4g} times those of the joints: counts or volts?; '
+                           f'angular rates must be in rad/s, they are {ratio:.4g} times the rates of the joints: counts or volts?; '
                       'give a nominal scaling with gyroscope_offset and gyroscope_scale', key='nominal')
 
 
@@ -148,7 +148,7 @@ def _exchange(match, seen):
 
 def _cause(match, matrix, seen, table):
     if match.turned and match.mirrored:
-        return ('this recording cannot tell a turned sensor from a wrong sign; '
+        return ('this recording does not separate a rotated sensor from a wrong sign; '
                 'correct mount.rpy_deg or the sign of a joint axis in the table, or the signs in the driver')
     if match.mirrored:
         return 'left-handed axes, which no mounting explains; correct signs and order in the driver, or the joint axes in the table'

@@ -43,9 +43,9 @@ def frame(evidence: MessageEvidence) -> Iterator[CheckFinding]:
     if '' in names:
         yield CheckFinding('frame', WARNING, 'messages must name their frame, '
                            f'{evidence.frame_ids[""]} of {sum(evidence.frame_ids.values())} have an '
-                           "empty frame_id: nobody can transform them; set the driver's frame_id, usually imu_link")
+                           "empty frame_id: they cannot be transformed; set the driver's frame_id, usually imu_link")
     if len(names) > 1:
-        yield CheckFinding('frame', WARNING, 'messages of one topic must be those of one sensor, frame_ids are '
+        yield CheckFinding('frame', WARNING, 'messages of one topic must be of one sensor, frame_ids are '
                            + ', '.join(f"'{name}'" for name in names) + '; give each sensor a topic of its own')
     elif names[0]:
         yield CheckFinding('frame', GOOD, f"frame_id '{names[0]}'")
@@ -56,7 +56,7 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
     for name, matrix in evidence.covariances.items():
         if matrix[0, 0] == ABSENT:
             if name != 'orientation':
-                yield CheckFinding('covariance', NOTE, f'the covariance says that there is no {name} in these messages (-1)')
+                yield CheckFinding('covariance', NOTE, f'the covariance marks the {name} in these messages as absent (-1)')
             continue
         if not np.isfinite(matrix).all() or (np.diag(matrix) < 0).any():
             yield CheckFinding('covariance', WARNING, f'variances of the {name} must be finite and not negative, they are '
@@ -70,7 +70,7 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
             yield CheckFinding('covariance', WARNING, f'the covariance of the {name} must be symmetric, it is not; correct the driver')
         elif not np.diag(matrix).all():
             yield CheckFinding('covariance', WARNING, f'variances of the {name} must be greater than zero, '
-                               f'they are {_numbers(np.diag(matrix))}: a filter would believe those axes for ever; correct the driver')
+                               f'they are {_numbers(np.diag(matrix))}: a filter would treat these axes as exact; correct the driver')
         else:
             yield CheckFinding('covariance', GOOD, f'standard deviations of the {name}: {_numbers(np.sqrt(np.diag(matrix)))}')
 
@@ -100,7 +100,7 @@ def age(evidence: MessageEvidence) -> Iterator[CheckFinding]:
                            f'{"behind" if median > 0 else "ahead of"} it: transforms and filters drop such messages; '
                            'synchronise the clocks, or for a recording play /clock and set use_sim_time')
     else:
-        yield CheckFinding('age', GOOD, f'stamps are {1e3 * median:.1f} ms old when messages come')
+        yield CheckFinding('age', GOOD, f'stamps are {1e3 * median:.1f} ms old when messages are received')
 
 
 def _numbers(values):

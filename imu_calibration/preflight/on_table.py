@@ -67,7 +67,7 @@ def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckF
     span = '' if exchange.span is None else ' from {:.0f} s to {:.0f} s'.format(*exchange.span)
     remedy = ('correct names and axes in the table description, or the joint states' if exchange.joints
               else 'correct the axes in the driver of the IMU') + ('' if exchange.span is None else ', or exclude that time')
-    return CheckFinding('on_table', REFUSE, f'the rates of the gyroscope must be those of the joints{span}, '
+    return CheckFinding('on_table', REFUSE, f'the rates of the gyroscope must agree with the joints{span}, '
                         f'{100 * exchange.share:.0f} % of them are explained if {phrases}; {remedy}'
                         + (f'; or {_late(shift.seconds)}' if late else ''))
 

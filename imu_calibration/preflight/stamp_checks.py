@@ -13,9 +13,9 @@ ADVICE = {
     'not finite': 'the driver sends them; they are left out',
     'repeated stamp': 'stamp each sample when it is measured; the second of equal stamps is left out',
     'backward stamp': 'samples that arrive late are left out; publish in order',
-    'stray stamp': 'a single stamp far from its neighbours is left out',
-    'spike': 'readings that no motion of the samples around them explains are left out; if they are many, look at the bus and the driver',
-    'clock reset': 'the clock was set while recording; each part is taken by itself',
+    'stray stamp': 'a single outlying stamp is excluded',
+    'spike': 'readings that differ from their neighbours beyond any motion are excluded; if they are many, check the bus and the driver',
+    'clock reset': 'the clock was set while recording; the parts are processed separately',
 }
 SPIKE_SHARE = 5e-3
 """A knock now and then looks like one, and one per cent of them costs a calibration nothing; this many have a cause."""
@@ -39,8 +39,8 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             continue
         if found.unstamped:
             yield CheckFinding('stamps', WARNING,
-                               f'{NAMES[name]}: {found.unstamped} of {total} stamps are zero, the driver sets none: the time of arrival '
-                               'is taken; let the driver stamp each sample when it is measured')
+                               f'{NAMES[name]}: {found.unstamped} of {total} stamps are zero: the time of arrival '
+                               'is used; the driver should stamp each sample at its measurement')
         for reason, count in found.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
             yield CheckFinding('stamps', severity, f'{NAMES[name]}: {count} of {total} samples {_phrase(reason)}: {ADVICE[reason]}'
@@ -80,9 +80,9 @@ def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             nominal, real = stream.statistics.rate, stream.real_rate
             if nominal and abs(real / nominal - 1) > RATE_SHARE:
                 yield CheckFinding('sampling', WARNING,
-                                   f'{NAMES[name]}: the usual step between stamps promises {nominal:.2f} Hz, {real:.2f} Hz came: '
+                                   f'{NAMES[name]}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is {real:.2f} Hz: '
                               'samples were lost, or stamps are made when messages arrive; '
-                              'look at the driver and at the load of the recorder')
+                              'check the driver and the load of the recorder')
             elif nominal:
                 yield CheckFinding('sampling', GOOD, f'{NAMES[name]}: {real:.2f} Hz, as the steps between stamps promise')
 
@@ -124,4 +124,4 @@ def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     elif overlap < 0.9 * shorter:
         yield CheckFinding('clocks', WARNING,
                            f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin {abs(late):.1f} s '
-                      f'{"after" if late > 0 else "before"} the Imu: only what overlaps is used; are both stamped by one clock?')
+                      f'{"after" if late > 0 else "before"} the Imu: only the overlap is used; are both stamped by one clock?')

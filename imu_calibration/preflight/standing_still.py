@@ -44,14 +44,14 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     if spans:
         return CheckFinding('frozen', REFUSE, 'the gyroscope must measure all the time, '
                             f'it repeats one reading {_words(spans)} while the joints turn; '
-                            'look at the sensor and its driver, and leave that time out')
+                            'check the sensor and its driver, and exclude that time')
     bias = np.median(np.concatenate([window.rate_s - rate for window, rate in zip(windows, told)]), axis=0)
     for k, name in enumerate(table.joint_names):
         spans = _joined(span for window, rate in zip(windows, told) for span in _frozen(window, table, rate + bias, joint=k))
         if spans:
             return CheckFinding('frozen', REFUSE, 'joint states must follow the table, '
-                                f'{name} stands still {_words(spans)} while the IMU turns about its '
-                                'axis; look at the driver of the table, and leave that time out')
+                                f'{name} is constant {_words(spans)} while the IMU turns about its '
+                                'axis; check the driver of the table, and exclude that time')
     return None
 
 

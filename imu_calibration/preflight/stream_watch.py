@@ -142,17 +142,17 @@ class StreamWatch:
         """Return the word and the line that say how the streams are."""
         if silent:
             none = len(silent) == len(self._needed)
-            return SILENT if none else TROUBLE, f'no {" and no ".join(MESSAGES[name] for name in silent)} messages come' + (
-                '' if none else ', nothing can be used meanwhile')
+            return SILENT if none else TROUBLE, f'no {" and no ".join(MESSAGES[name] for name in silent)} messages received' + (
+                '' if none else ', no data can be used until then')
         lead = (self._newest['imu'] - self._newest['joints']) * 1e-9 if 'joints' in self._needed else 0.0
         if self._apart_for(lead, now) > SILENT_AFTER:
             return TROUBLE, (f'the Imu stamps are {abs(lead):.1f} s {"ahead of" if lead > 0 else "behind"} the joint stamps; '
                              'bring the clocks together')
         if self._stamping is not None and self._stamping.word == IRREGULAR:
-            return TROUBLE, f"{self._stamping}: when each sample was taken cannot be told; let the driver stamp by the sensor's clock"
+            return TROUBLE, f"{self._stamping}: sampling times are unknown; the driver should stamp by the sensor's clock"
         if self._unstamped_at is not None and now - self._unstamped_at < RECENT:
             notes = ', '.join(f'{count} {reason}' for reason, count in self._notes.items())
-            return TROUBLE, f'{notes}: the driver sets none, the time of arrival is taken'
+            return TROUBLE, f'{notes}: the driver sets none, the time of arrival is used'
         if recently := self._recently(now):
             return TROUBLE, f'dropped lately: {recently}'
         return GOOD, f'{" and ".join(MESSAGES[name] for name in self._needed)} messages come'

@@ -53,10 +53,10 @@ def force_error(length: float, where: str = 'at rest') -> InputError | None:
     """Return the error for a median length of the specific force that is not gravity in m/s^2, None for one that can be."""
     said = f'specific force must be in m/s^2, its length {where} is {length:.4g}: '
     if unit := unit_of_rest(length):
-        return InputError(f'{said}it looks like {unit}; convert it in the driver or give a nominal scaling with accelerometer_scale '
+        return InputError(f'{said}it is probably {unit}; convert it in the driver or give a nominal scaling with accelerometer_scale '
                           f'{OTHER_UNITS[unit]:.6g}', key='nominal', code='force_unit')
     if length < LINEAR:
-        return InputError(f'{said}it looks like acceleration without gravity, as phones compute it; record the accelerometer itself',
+        return InputError(f'{said}it is probably acceleration without gravity, as phones compute it; record the raw accelerometer',
                           key='imu_topic', code='without_gravity')
     if not 3.0 < length < 30.0:
         return InputError(f'{said}counts or volts?; give a nominal scaling with accelerometer_offset and accelerometer_scale',
@@ -76,19 +76,19 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     scaling = 'give a nominal scaling with gyroscope_offset and gyroscope_scale'
     if turning is not None:
         ratio = 1.0 / turning.factor
-        came = f'angular rates must be in rad/s, they are {significant(ratio)} times what turns the measured gravity: '
+        came = f'angular rates must be in rad/s, they are {significant(ratio)} times the rotation of the measured gravity: '
         if 0.6 < ratio * DEG < 1.6:
             yield _unit('rate_unit',
-                        f'{came}they look like deg/s; convert them in the driver or give a nominal scaling with gyroscope_scale 57.29578')
+                        f'{came}probably deg/s; convert them in the driver or give a nominal scaling with gyroscope_scale 57.29578')
         elif 0.6 < ratio / DEG < 1.6:
-            yield _unit('rate_unit', f'{came}they look as if converted from deg/s twice; convert once, or give a nominal scaling with '
+            yield _unit('rate_unit', f'{came}probably converted from deg/s twice; convert once, or give a nominal scaling with '
                                      'gyroscope_scale 0.01745329')
         elif _full_scale(evidence) is not None:
             return
         elif not 0.5 < ratio < 2.0:
             yield _unit('rate_unit', f'{came}counts or volts?; {scaling}')
         else:
-            yield CheckFinding('rate_unit', GOOD, f'angular rate in rad/s: gravity turns as the rates{_about(turning.axes)} say')
+            yield CheckFinding('rate_unit', GOOD, f'angular rate in rad/s: gravity rotates according to the rates{_about(turning.axes)}')
     elif largest > FASTEST:
         unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
         yield _unit('rate_unit', f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
@@ -100,14 +100,14 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     factor = _full_scale(evidence)
     if factor is None:
         return
-    came = f'angular rates are {factor:.3g} times those that turn gravity from one rest to the next'
+    came = f'angular rates are {factor:.3g} times the rotation of gravity from one rest to the next'
     if abs(np.log2(factor)) % 1 == 0:
         yield CheckFinding('full_scale', WARNING,
                            f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set; correct its '
-                      'setting (a calibration takes the factor up into the matrix, and is wrong once the setting is right)')
+                      'setting (a calibration would include the factor in the matrix, and be wrong after the correction)')
     else:
         yield CheckFinding('full_scale', WARNING,
-                           f'{came}: the scale of the driver is far off; correct it, or check that the IMU rested where it seems to')
+                           f'{came}: the scale of the driver is wrong; correct it, or check that the IMU was at rest')
 
 
 def _full_scale(evidence):
@@ -134,9 +134,9 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     if not what or match.agreement < CLEAR:
         what = 'no exchange of axes makes them fit'
     kinds = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}
-    kind = kinds.get((match.turned, match.mirrored), 'turned or left-handed, the recording cannot tell')
+    kind = kinds.get((match.turned, match.mirrored), 'turned or left-handed, not separable in this recording')
     yield CheckFinding('handedness', REFUSE,
-                       'accelerometer and gyroscope must share right-handed axes, gravity does not turn as the rates say: '
+                       'accelerometer and gyroscope must share right-handed axes, gravity does not rotate according to the rates: '
                   f'{what} ({kind}); correct signs and order of the axes in the driver')
 
 
@@ -161,7 +161,7 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             people = f' ({level / DEG:.0f} deg/s)' if unit == 'rad/s' else f' ({level / STANDARD_GRAVITY:.1f} g)'
             yield CheckFinding('clipping', WARNING,
                                f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at the end of the range; '
-                          'what is beyond is lost, move less or choose a wider range', samples=total)
+                          'larger values are lost, move less or choose a wider range', samples=total)
 
 
 def _held(evidence, sensor):
@@ -187,8 +187,8 @@ def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             people = f'{size / STANDARD_GRAVITY:.2f} g' if sensor == 'accelerometer' else f'{size / DEG:.0f} deg/s'
             values = ', '.join(f'{value:+.2f}' for value in found[sensor])
             yield CheckFinding('bias', WARNING,
-                               f'the bias of the {sensor} is {people} ([{values}] {unit}), more than any grade of sensor has; look at '
-                          'offsets in the driver, or at the supply and the soldering of the sensor')
+                               f'the bias of the {sensor} is {people} ([{values}] {unit}), more than any grade of sensor has; check '
+                          'offsets in the driver, the supply and the soldering of the sensor')
 
 
 def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -199,15 +199,15 @@ def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     off = rest.length / evidence.gravity - 1
     if rest.sphere is not None:
         bias = np.linalg.norm(rest.sphere[0])
-        what = f'{len(rest.force)} poses, bias of {bias:.2f} m/s^2 taken out'
+        what = f'{len(rest.force)} poses, bias of {bias:.2f} m/s^2 subtracted'
     else:
         what = f'median of {len(rest.force)} stretches' if len(rest.force) > 1 else 'one stretch'
     if abs(off) > GRAVITY_SHARE:
         yield CheckFinding('gravity', WARNING,
                            f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, '
                            f'the accelerometer reads {rest.length:.3f} ({what}), '
-                      f'{100 * off:+.1f} %: scale or bias is far off (gravity itself differs by '
-                      f'{100 * PLACE} % between places)')
+                      f'{100 * off:+.1f} %: scale or bias is wrong (gravity differs by '
+                      f'{100 * PLACE} % between sites)')
     else:
         yield CheckFinding('gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})')
 

@@ -26,15 +26,15 @@ def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
     count, bound = int(plan.wanted.sum()), plan.lower_bound_seconds
     met = int((plan.sd <= plan.tolerances * (1 + 1e-6))[plan.wanted].sum())
     tiles = [_tile('time', text(plan.seconds), 's', f'{len(plan.motions)} motions'),
-             _tile('least time', text(bound), 's', 'no plan of these motions takes less') if np.isfinite(bound) else
+             _tile('least time', text(bound), 's', 'lower bound for plans of these motions') if np.isfinite(bound) else
              _tile('least time', 'not worked out', '', ''),
              _tile('within tolerance', f'{met} of {count}', '', 'parameters')]
     sense = _kinds(plan)
     if plan.missing:
-        sense = f'whatever these joints do within their limits, this stays out of reach: {", ".join(plan.missing)}'
+        sense = f'out of reach for every motion of these joints within their limits: {", ".join(plan.missing)}'
     return _page(plan.model, {name: k for k, name in enumerate(plan.model.param_names) if plan.wanted[k]}, plan.sd, plan.tolerances,
                  word='good' if not plan.missing else 'weak', sense=sense, tiles=tiles, facts=_facts(provenance), motion=draw_motion(plan),
-                 headline=f'{plan.told_apart} told apart after {text(plan.seconds)} s' if plan.told_apart and not plan.missing else
+                 headline=f'{plan.told_apart} separated after {text(plan.seconds)} s' if plan.told_apart and not plan.missing else
                  f'{met} of {count} parameters within tolerance after {text(plan.seconds)} s', caption=CAPTION, reading=READING,
                  count='until, s', progress=draw_progress(plan), rows=_rows(plan))
 
@@ -56,11 +56,11 @@ def hand_plan_report(plan: HandPlan, model: SensorModel, provenance: dict[str, A
                  progress=draw_steps_progress(plan), rows=rows)
 
 
-CAPTION = ('Positions of the joints; the band above tells the kind of motion. Angles of joints without end are drawn within one turn.')
+CAPTION = ('Positions of the joints; the band above shows the kind of motion. Angles of endless joints are drawn within one turn.')
 READING = ('The standard deviations are those that a calibration of this motion will report, from the same columns, windows and noise. The '
-           'biases wander as the grade or the noise file says: that is why long rests are rare and returns are not.',
-           'The least time is a lower bound: information is counted as if every window were free of what the others say of the biases, and '
-           'motions as if they could be done a fraction of a time and in any place without going there. No plan made of the same motions '
+           'biases wander according to the grade or the noise file: therefore long rests are rare and returns are frequent.',
+           'The least time is a lower bound: information is counted as if the biases of different windows were independent, and '
+           'motions as if fractions of them and moves of zero length were possible. No plan made of the same motions '
            'is shorter.')
 
 

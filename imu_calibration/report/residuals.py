@@ -50,7 +50,7 @@ class _Windows:
         lower.fill_between(errors.time[order], -floor[order], floor[order], step='mid', color='#dfe5ec', lw=0, zorder=0.5)
         self._points(lower, errors.after[sensor] * factor)
         upper.set_title(f'before: rms {text(errors.rms(sensor, "before") * factor)} {unit}')
-        lower.set_title(f'after: rms {text(errors.rms(sensor, "after") * factor)} {unit}; grey: two sd of what noise alone leaves')
+        lower.set_title(f'after: rms {text(errors.rms(sensor, "after") * factor)} {unit}; grey: two sd of the expected residual from noise')
         for axes in (upper, lower):
             axes.axhline(0, color=GREY, lw=0.6)
             axes.set_ylabel(unit)

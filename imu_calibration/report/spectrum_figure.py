@@ -11,7 +11,7 @@ def draw_tones(sensor: str, rest: Unexplained) -> str:
     """Return the spectra in which tones stand out, as SVG; empty where there is none."""
     if not rest.tones:
         return ''
-    label = f'Spectrum of what stays unexplained in the {sensor}'
+    label = f'Spectrum of the unexplained residual of the {sensor}'
     return draw(f'tones-{sensor}', (8.6, 0.6 + 2.1 * len(rest.tones)), _Spectra(rest.tones), label=label)
 
 

@@ -49,8 +49,8 @@ def _steps(result, sample, corrected):
     how = 'M⁻¹ (raw − b − u), accelerometer' if np.any(arms) else 'M⁻¹ (raw − b), accelerometer'
     steps.append(('corrected specific force', 'm/s²', corrected.force[0], how if plain else ''))
     if sample.true_force is not None:
-        steps += [('the table says: rate', 'rad/s', sample.true_rate, 'the noise of one sample remains'),
-                  ('the table says: force', 'm/s²', sample.true_force, '')]
+        steps += [('reference of the table: rate', 'rad/s', sample.true_rate, 'the difference is the noise of one sample'),
+                  ('reference of the table: force', 'm/s²', sample.true_force, '')]
     return [{'what': what, 'unit': unit, 'values': [fixed(v, 5) for v in values], 'how': how, 'mark': what.startswith('corrected')}
             for what, unit, values, how in steps]
 

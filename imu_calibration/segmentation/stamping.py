@@ -77,7 +77,7 @@ class StampLine:
         if self.word == IRREGULAR:
             return f'the steps between stamps scatter and follow no clock near {rate:.4g} Hz'
         if self.at_once >= PACKET:
-            return f'stamps are those of arrival, about {self.at_once:.0f} samples at once; regular times at {rate:.4g} Hz are drawn ' \
+            return f'stamps are times of arrival, about {self.at_once:.0f} samples at once; regular times at {rate:.4g} Hz are drawn ' \
                 'through them'
         return (f'stamps scatter by {1e-6 * (self.high_ns - self.low_ns):.3g} ms about a clock; regular times at {rate:.4g} Hz are drawn '
                 'through them')

@@ -53,7 +53,7 @@ def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> 
     if not (np.isfinite(imu.force_s).all() and np.isfinite(imu.rate_s).all()):
         raise InputError('samples must be finite to search for rest, got NaN or infinite values; drop them first', code='not_finite')
     if np.any(step < 0):
-        raise InputError('stamps must not go backwards in the search for rest, got a backward step; clean the stream first',
+        raise InputError('stamps must not decrease in the search for rest, got a backward step; clean the stream first',
                          code='stamps_backwards')
     if not np.any(step > 0):
         return []

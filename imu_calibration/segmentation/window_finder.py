@@ -103,7 +103,7 @@ class MotionGatherer:
         """
         for name in ('chunk', 'overlap', 'turn_on'):
             if getattr(settings, name) != getattr(self._settings, name):
-                raise InputError(f"setting '{name}' must stay as it is while a session goes on; start anew with it")
+                raise InputError(f"setting '{name}' must not change during a session; restart with it")
         self._settings = settings
         self._chunks.change(settings)
         self._cutter.change(settings, self._chunks.short_rest)

@@ -79,7 +79,7 @@ class Evidence(ABC):
 
     def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """Return the loss on held-out data by sensor: of the windows' means and within the windows, of each axis, shape (2, 3)."""
-        raise NotImplementedError(f'{type(self).__name__} knows of no effect that acts on both sensors')
+        raise NotImplementedError(f'{type(self).__name__} has no effect that acts on both sensors')
 
     def fit(self, used: Sequence[int], number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, covariance) of the parameters `used`, fitted to everything or to all but fold `number`."""

@@ -117,7 +117,7 @@ def _not_shaken(effect, shaken):
 
 def _not_turned(effect, turned):
     if 'cooling' in effect.needs and not turned:
-        return 'the temperature did not turn, so that it came one way only', f'record while it warms up and while it cools, by {TURN:g} K'
+        return 'the temperature did not reverse: one branch only', f'record while it warms up and while it cools, by {TURN:g} K'
     return None
 
 
@@ -132,7 +132,7 @@ def _why_not(effect, have, table, kinds, span):
     if 'dynamic' in effect.needs and not moving:
         return 'the recording has no motion', 'swing the table at several frequencies'
     if (effect.sensor, effect.contained_in) in have:
-        return f'the {effect.contained_in} of the model contains it', f'leave {effect.contained_in} out of the model'
+        return f'the {effect.contained_in} of the model contains it', f'omit {effect.contained_in} in the model'
     return effect.moot(table) if effect.moot else None
 
 

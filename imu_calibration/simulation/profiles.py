@@ -108,7 +108,7 @@ def _require_within(profile, limits):
         if reached[0] < limits.lower[column] - 1e-6 or reached[1] > limits.upper[column] + 1e-6:
             unit, factor = ('deg', np.degrees(1.0)) if limits.turns[column] else ('m', 1.0)
             lower, upper, least, most = (f'{factor * end:.4g}' for end in (limits.lower[column], limits.upper[column], *reached))
-            raise InputError(f"profile '{profile.name}' must keep joint '{name}' within [{lower}, {upper}] {unit}, it would go from "
+            raise InputError(f"profile '{profile.name}' must keep joint '{name}' within [{lower}, {upper}] {unit}, it would move from "
                              f"{least} to {most}; choose 'within_limits'", code='joint_range')
 
 
@@ -264,22 +264,22 @@ _REGISTRY = {
     'calibration': _Entry('full session on a three-axis table, about 11 min: poses, spins, swings, two axes at once', _calibration,
                           n_joints=3, adapts=True),
     'short': _Entry('the same in about 5 min', _short, n_joints=3, adapts=True),
-    'quick': _Entry('the least that determines everything, about 2 min', _quick, n_joints=3, adapts=True),
-    'six_faces': _Entry('every axis up and down, and turned both ways at one speed, about 1 min: leaves similar effects alike', _six_faces,
+    'quick': _Entry('the shortest that determines all parameters, about 2 min', _quick, n_joints=3, adapts=True),
+    'six_faces': _Entry('every axis up and down, and turned both ways at one speed, about 1 min: similar effects are collinear', _six_faces,
                         n_joints=3, adapts=True),
     'static_only': _Entry('26 poses, no deliberate rotation', _static_only, n_joints=3),
     'random': _Entry('poses, spins, swings and two-axis turns drawn from the seed, about 5 min', _random, n_joints=3, adapts=True),
     'random_short': _Entry('the same in about 3 min, with two speeds', _random_short, n_joints=3, adapts=True),
-    'separating': _Entry('many angles, three speeds both ways, four frequencies: tells similar effects apart', _separating,
+    'separating': _Entry('many angles, three speeds both ways, four frequencies: separates similar effects', _separating,
                          n_joints=3, adapts=True),
     'separating_short': _Entry('the same with fewer angles, about 6 min', _separating_short, n_joints=3, adapts=True),
-    'separating_arm': _Entry('separating with the sensor on an arm of 0.27 m, so that spins leave 1 g', _separating, _ON_ARM, 3),
+    'separating_arm': _Entry('separating with the sensor on an arm of 0.27 m, so that spins exceed 1 g', _separating, _ON_ARM, 3),
     'thermal': _Entry('the same round six times while the temperature changes', _thermal, n_joints=3),
     'navigation': _Entry('rest, 50 s of slow tumbling, rest, 50 s of livelier tumbling', _navigation, n_joints=3),
     'tumbling': _Entry('60 s of three-axis sinusoids (60, 45, 30 deg at 0.7, 0.9, 1.1 Hz)', _tumbling, n_joints=3),
     'two_axis': _Entry('poses, spins, swings and simultaneous turns of a two-axis table', _any_table, n_joints=2),
     'within_limits': _Entry('poses, swings and, where a joint has no end, spins, within the limits of every joint', within_limits),
     'within_limits_short': _Entry('the same with fewer of them', within_limits_short),
-    'any_table': _Entry('poses, spins, swings and simultaneous turns of whatever joints the table has', _any_table),
+    'any_table': _Entry('poses, spins, swings and simultaneous turns of all joints of the table', _any_table),
     **{name: _Entry(*entry) for name, entry in paper_profiles.REGISTRY.items()},
 }

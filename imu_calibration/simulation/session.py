@@ -69,7 +69,7 @@ def hidden_effect(model: SensorModel, name: str, seed: int = 0, *, share: float 
     sensor = model.catalogue.owner_of(name, model.joint_names)
     effect = model.catalogue.find(sensor, name, model.joint_names)
     if not effect.plausible:
-        or_else = ', or say in its definition how large it may be (largest)' if effect.definition else ''
+        or_else = ', or give its largest size in its definition (largest)' if effect.definition else ''
         raise InputError(f"effect '{name}' cannot be simulated by name, for its size is not known; "
                          f'simulate with a calibration that contains it{or_else}', key='calibration', code='size_unknown')
     rng = np.random.default_rng([seed, 11])

@@ -25,12 +25,12 @@ KEPT = 8
 class ControllerSettings:
     """How the joints take a trajectory, and what goes wrong with them."""
 
-    limits: str = setting('refuse', '', 'what becomes of a trajectory beyond range, speed or acceleration of the joints: refuse, slow (it '
-                          'is followed as slowly as speed and acceleration ask; beyond the range it is refused) or none (it is followed)',
+    limits: str = setting('refuse', '', 'treatment of a trajectory beyond range, speed or acceleration of the joints: refuse, slow (it '
+                          'is slowed to the limits; beyond the range it is refused) or none (it is followed)',
                           symptom='trajectories are not followed, or further and faster than the joints can')
-    lag: float = setting(0.0, 's', 'the joints move so much later than a trajectory says', (0.0, 10.0), 'measured joints are late')
+    lag: float = setting(0.0, 's', 'delay of the joints relative to a trajectory', (0.0, 10.0), 'measured joints are late')
     speed_scaling: float = setting(1.0, '1', 'share of their speed at which trajectories are followed', (0.01, 1.0),
-                                   'motions take longer than they say')
+                                   'motions last longer than commanded')
     refuse_after: int = setting(-1, '1', 'trajectories that are followed before every further one is refused; -1: all are followed',
                                 (-1, 1_000_000), 'trajectories are not followed')
     stall_joint: str = setting('', '', 'joint that stalls', symptom='no joint stalls, or another one')
@@ -94,7 +94,7 @@ class TableController:
         if not len(points):
             return self._take(begin, braking_from(start, self.limits))
         if 0 <= self.settings.refuse_after <= self._n_followed:
-            raise InputError(f'the controller takes no more than {self.settings.refuse_after} trajectories; it was told so',
+            raise InputError(f'the controller accepts at most {self.settings.refuse_after} trajectories, by its parameter',
                              code='trajectory_count')
         points = points.slowed(self.settings.speed_scaling)
         trajectory = trajectory_from(start, points)
@@ -109,7 +109,7 @@ class TableController:
     def _within_limits(self, start, points, trajectory):
         beyond, speed, acceleration = excess(trajectory, self.limits)
         if beyond > ROUNDING:
-            raise InputError(f'a trajectory must stay within the range of the joints, it leaves it by {beyond:.3g} rad or m; '
+            raise InputError(f'a trajectory must stay within the range of the joints, it exceeds it by {beyond:.3g} rad or m; '
                              'see the limits in the description of the table', code='joint_range')
         fastest = max(speed, np.sqrt(acceleration))
         if fastest <= 1.0 + ROUNDING:

@@ -109,7 +109,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
     given = {**choices, 'earlier': earlier}
     earlier = files.read_calibration(earlier) if isinstance(earlier, (str, PathLike)) else earlier
     if earlier is not None and table is None:
-        raise InputError('an earlier calibration must be compared on a table, none came; give its description', key='table',
+        raise InputError('an earlier calibration must be compared on a table, none was given; give its description', key='table',
                          code='table_missing')
     recordings = [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
     stand, table = table, None if table is None else table_of(table, recordings, topics, gravity=choices.get('gravity'))

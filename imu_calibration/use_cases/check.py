@@ -88,10 +88,10 @@ def _gravity(options, calibration):
     if options.gravity:
         return ()
     taken = gravity_of(calibration, options)
-    return (f'gravity was taken to be {taken:.6g} m/s^2, as where it was calibrated; give the local one where it differs',)
+    return (f'gravity is that of the calibration, {taken:.6g} m/s^2; give the local value if it differs',)
 
 
 def _notes(recording, calibration):
     """Return a note when the calibration was made from this very recording."""
     same = made_from(calibration.provenance) & made_from(provenance_of([recording], {}))
-    return ('it was calibrated from this recording: the result can differ on others',) if same else ()
+    return ('it was calibrated from this recording: the result can differ on new recordings',) if same else ()

@@ -155,7 +155,7 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     causes, sizes = (tuple(separate), {}) if separate or not diagnosis else _class_of(diagnosis)
     if causes:
         if known is None:
-            raise InputError('effects are told apart beside the calibration of the diagnosis that found the first, none was given; give it',
+            raise InputError('separation of effects needs the calibration of the diagnosis with the finding, none was given; give it',
                              key='calibration')
         owners = [(options.catalogue.owner_of(name, table.joint_names), name) for name in causes]
         planner = make_separator(table, known, owners, noise=noise, rate=imu_rate, options=options, sizes=sizes, limits=limits)
@@ -252,7 +252,7 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
 def hand_summary(made: HandPlan) -> list[str]:
     """Return what a plan by hand promises, a line each."""
     count = len(made.param_names)
-    lines = [f'{len(made.steps)} poses and turns, about {made.seconds:.0f} s; {count - len(made.missing)} of {count} parameters come '
+    lines = [f'{len(made.steps)} poses and turns, about {made.seconds:.0f} s; {count - len(made.missing)} of {count} parameters are '
              'within their tolerance']
     return lines + ([f'out of reach by hand: {", ".join(made.missing)}'] if made.missing else [])
 
@@ -275,7 +275,7 @@ def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, fl
         if finding.get('indistinguishable_from'):
             sizes = {name: float(size['value']) for mate in finding.get('sizes_of_mates', {}).values() for name, size in mate.items()}
             return (finding['effect'], *finding['indistinguishable_from']), sizes
-    raise InputError('the diagnosis must have a finding with others that would do as well, it has none; nothing is left to be told apart',
+    raise InputError('the diagnosis must have a finding with collinear effects, it has none; no effects need to be separated',
                      code='nothing_to_separate')
 
 
@@ -284,12 +284,12 @@ def summary(made: Plan) -> list[str]:
     if made.told_apart:
         head = f'{len(made.motions)} motions in {made.seconds:.0f} s'
         if not made.missing:
-            return [f'{head} tell {made.told_apart} apart']
-        return [head, f'as large as they are suspected, these stay alike whatever these joints do in that time: {", ".join(made.missing)}']
+            return [f'{head} separate {made.told_apart}']
+        return [head, f'at their assumed sizes, no motion of these joints in that time separates: {", ".join(made.missing)}']
     count, met = int(made.wanted.sum()), int(made.wanted.sum()) - len(made.missing)
-    lines = [f'{len(made.motions)} motions in {made.seconds:.0f} s; {met} of {count} parameters come within their tolerance']
+    lines = [f'{len(made.motions)} motions in {made.seconds:.0f} s; {met} of {count} parameters are within their tolerance']
     if np.isfinite(made.lower_bound_seconds) and made.lower_bound_seconds > 0 and not made.missing:
-        lines.append(f'no plan of these motions with the same probability (95 %) takes less than {made.lower_bound_seconds:.0f} s')
+        lines.append(f'every plan of these motions with the same probability (95 %) needs at least {made.lower_bound_seconds:.0f} s')
     if made.missing:
-        lines.append(f'outside their tolerance whatever these joints do within their limits: {", ".join(made.missing)}')
+        lines.append(f'outside their tolerance for every motion of these joints within their limits: {", ".join(made.missing)}')
     return lines

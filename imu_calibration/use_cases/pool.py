@@ -12,7 +12,7 @@ from imu_calibration.errors import InputError
 def jobs_for(asked: int | None, n_items: int) -> int:
     """Return the number of processes: what was asked for, else one per processor; never more than there are items."""
     if asked is not None and asked < 1:
-        raise InputError(f'at least one process must work, got {asked}; leave the number out to use every processor', key='jobs')
+        raise InputError(f'at least one process must work, got {asked}; omit the number to use every processor', key='jobs')
     return max(1, min(asked or os.cpu_count() or 1, n_items))
 
 
@@ -66,14 +66,14 @@ def cluster_mapper(address: str, done: Callable[[Any], object] = lambda item: No
     try:
         from dask import distributed
     except ImportError as error:
-        raise InputError('a scheduler needs dask.distributed, which is not installed; install imu_calibration[dask], or leave it out',
+        raise InputError('a scheduler needs dask.distributed, which is not installed; install imu_calibration[dask], or omit it',
                          key='scheduler') from error
 
     def mapped(function, items):
         try:
             client = distributed.Client(address, timeout='10s', set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(f'there must be a dask scheduler that answers at {address}: {" ".join(str(error).split())}; '
+            raise InputError(f'a dask scheduler must be reachable at {address}: {" ".join(str(error).split())}; '
                              'start one with dask scheduler', key='scheduler') from error
         with client, client.as_current():
             futures = client.map(function, list(items), pure=False)

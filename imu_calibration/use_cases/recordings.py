@@ -39,7 +39,7 @@ class Topics(NamedTuple):
 def existing(path: str | PathLike) -> Path:
     """Return the path of a bag that is there."""
     if not Path(path).exists():
-        raise InputError(f'the bag {path} must exist, there is nothing there; correct the path')
+        raise InputError(f'the bag {path} must exist, no such file; correct the path')
     return Path(path)
 
 

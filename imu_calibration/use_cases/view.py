@@ -47,7 +47,7 @@ class View:
     def lacks(self) -> tuple[str, ...]:
         """What cannot be shown, and why."""
         if self.coverage is None:
-            return ('a calibration file holds no residuals: the parameters alone are shown; give the recording for the rest',)
+            return ('a calibration file contains no residuals: only the parameters are shown; give the recording for residuals',)
         if SPECTRUM not in self.contents:
             return ('no window with motion was long enough for a spectrum, and by hand there is none: it is left out',)
         return ()
@@ -94,8 +94,8 @@ def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **cho
             del contents[SPECTRUM]
         return View(result.calibration, contents, _coverage(result), contents[RESIDUAL]['windows'][-1]['time'])
     if table is not None:
-        raise InputError('a table or arm says how a recording moved and must come with a recording, a calibration file came; '
-                         'leave one out')
+        raise InputError('a table or arm needs a recording, a calibration file was given; '
+                         'omit one')
     calibration = files.read_calibration(path)
     return View(calibration, {PARAMETERS: parameters(calibration, tolerances_of(calibration.model))}, None)
 

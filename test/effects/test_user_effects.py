@@ -81,7 +81,7 @@ def test_it_is_simulated_calibrated_compensated_and_checked_from_files_alone(min
     ('effects:\n  mine: 3', "effect 'mine' must have sensor"), ('effects:\n  effects: ' + MINE[10:].split(':', 1)[0], 'must have'),
     (MINE.replace('f_x', 'f_q'), "the unknown name 'f_q' at character 1: 'f_q * (temperature_c - 25)'"),
     (MINE.replace('f_x', 'f_q'), "effect 'gyro_warm_force': a column must be arithmetic"),
-    (MINE.replace('- 25', '- 25 ** 0.5'), 'a power that is not a whole number up to 9 at character 30'),
+    (MINE.replace('- 25', '- 25 ** 0.5'), 'a power that is not an integer up to 9 at character 30'),
     (MINE.replace('- 25)', '- 25'), "this cannot be read at character 7"),
     (MINE.replace('gyro_warm_force', 'gyro_quadratic'), 'must have a name of its own'),
     (MINE.replace('gyro_warm_force', 'effects'), 'must have a name of its own'),

@@ -219,12 +219,12 @@ def in_kelvin(imu, joints, temperature):
 
 
 FAULTS = (
-    (in_g, 'force_unit', REFUSE, ('m/s^2', 'looks like g', 'accelerometer_scale 0.101972')),
+    (in_g, 'force_unit', REFUSE, ('m/s^2', 'accelerometer_scale 0.101972')),
     (in_mg, 'force_unit', REFUSE, ('mg', 'accelerometer_scale 101.972')),
     (in_counts, 'force_unit', REFUSE, ('counts', 'nominal scaling')),
     (in_counts, 'rate_unit', REFUSE, ('counts', 'nominal scaling')),
     (without_gravity, 'force_unit', REFUSE, ('m/s^2', 'gravity')),
-    (in_degrees, 'rate_unit', REFUSE, ('rad/s', 'look like deg/s', 'gyroscope_scale 57.29578')),
+    (in_degrees, 'rate_unit', REFUSE, ('rad/s', 'deg/s', 'gyroscope_scale 57.29578')),
     (twice_converted, 'rate_unit', REFUSE, ('twice',)),
     (mirrored_gyroscope, 'handedness', REFUSE, ("the gyroscope's y is minus the accelerometer's y", 'left-handed')),
     (gyroscope_axes_swapped, 'handedness', REFUSE,
@@ -233,11 +233,11 @@ FAULTS = (
      ("the gyroscope's x is the accelerometer's y", "the gyroscope's y is minus the accelerometer's x", 'turned against')),
     (dead_axis, 'frozen', REFUSE, ('accelerometer y never changes',)),
     (dead_gyroscope, 'frozen', REFUSE, ('the gyroscope must measure something',)),
-    (stuck_axis, 'frozen', WARNING, ('gyroscope y stands still',)),
+    (stuck_axis, 'frozen', WARNING, ('gyroscope y',)),
     (imu_frozen_for_a_time, 'frozen', WARNING, ('the IMU must measure', 'from 40.', 's to 70.')),
     (gyroscope_frozen_for_a_time, 'frozen', WARNING, ('the gyroscope must measure', 'from 40.')),
     (gyroscope_frozen_at_its_largest, 'frozen', WARNING, ('the gyroscope must measure',)),
-    (joints_frozen_for_a_time, 'frozen', WARNING, ('stand still while the IMU turns', 'from ')),
+    (joints_frozen_for_a_time, 'frozen', WARNING, ('joint states', 'from ')),
     (half_a_g_off, 'bias', WARNING, ('0.47 g', 'any grade')),
     (fast_at_rest, 'bias', WARNING, ('80 deg/s', 'any grade')),
     (clipped_gyroscope, 'clipping', WARNING, ('gyroscope clips at 1 rad/s (57 deg/s)',)),
@@ -248,9 +248,9 @@ FAULTS = (
     (not_finite, 'stamps', WARNING, ('not finite',)),
     (two_clocks, 'clocks', REFUSE, ('one clock', 'before the Imu', 'never overlap')),
     (late_joints, 'clocks', WARNING, ('60.0 s after the Imu',)),
-    (lost_samples, 'sampling', WARNING, ('promises', 'samples were lost')),
+    (lost_samples, 'sampling', WARNING, ('Hz', 'samples were lost')),
     (holes, 'gaps', WARNING, ('gaps', 'not used')),
-    (wrong_gravity, 'gravity', WARNING, ('within 2 %', '+4.', 'differs by 0.5 % between places')),
+    (wrong_gravity, 'gravity', WARNING, ('within 2 %', '+4.', '0.5 %')),
     (published_twice, 'repeated_readings', WARNING, ('50 %', 'publishes faster')),
     (in_kelvin, 'temperature', WARNING, ('kelvin',)),
 )
@@ -517,7 +517,7 @@ def test_inspect_returns_the_worst_code_of_all_imus(capsys, tmp_path, session, t
             topic = bag.add_topic(f'/imu_{k}', standard_definition(IMU_TYPE))
             bag.write(np.full(len(imu), topic), imu.stamp_ns, rows(encode_imu(imu)))
     assert main(['inspect', str(tmp_path / 'bag')]) == 3
-    assert 'it looks like g;' in capsys.readouterr().out
+    assert 'accelerometer_scale 0.101972' in capsys.readouterr().out
     assert main(['inspect', str(tmp_path / 'bag'), '--imu-topic', f'/imu_{1 - bad}']) == 0
 
 

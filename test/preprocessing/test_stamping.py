@@ -104,8 +104,7 @@ def test_inspect_sees_the_same():
     assert any(severity == 'warning' and 'follow no clock' in text for text, severity in irregular.items())
     assert not any('clock near' in text or 'drawn through' in text for text in findings(samples(TRUE)))
     zero = findings(samples(TRUE), {'Imu zero stamp': 400})
-    assert zero[f'Imu: 400 of {N} stamps are zero, the driver sets none: the time of arrival is taken; let the driver stamp each sample when it is '
-                'measured'] == 'warning'
+    assert [severity for text, severity in zero.items() if text.startswith(f'Imu: 400 of {N} stamps are zero')] == ['warning']
     assert describe_stamps(stamps_of('usb packets', TRUE, None)).word == COUNTED
 
 

@@ -148,8 +148,8 @@ def test_the_worked_sample_can_be_followed_with_the_printed_numbers(on_table):
         by_reader = np.array([number(row) for row in matrix['inverse']]) @ (steps[raw] - number(matrix['bias']) - lever[raw])
         assert by_reader == pytest.approx(steps[corrected], abs=3e-5)
     noise = on_table.solution.noise
-    assert np.all(np.abs(steps['corrected specific force'] - steps['the table says: force']) < 5 * noise['accelerometer'].white_sd)
-    assert np.all(np.abs(steps['corrected rate'] - steps['the table says: rate']) < 5 * noise['gyroscope'].white_sd)
+    assert np.all(np.abs(steps['corrected specific force'] - steps['reference of the table: force']) < 5 * noise['accelerometer'].white_sd)
+    assert np.all(np.abs(steps['corrected rate'] - steps['reference of the table: rate']) < 5 * noise['gyroscope'].white_sd)
 
 
 def test_windows_after_calibration_scatter_as_noise_alone_would(on_table, by_hand):

@@ -96,11 +96,11 @@ def ignored(found: dict) -> list[str]:
     lines = []
     offset, scale = vector_of(found, OFFSET['accelerometer'] + '_*'), vector_of(found, SCALE + '_*', 1.0)
     if np.any(np.abs(offset) > LARGEST_OFFSET):
-        lines.append(f'ArduPilot takes INS_ACCOFFS up to {LARGEST_OFFSET:g} m/s^2, here {np.abs(offset).max():.3g}: arming will be refused')
+        lines.append(f'ArduPilot accepts INS_ACCOFFS to {LARGEST_OFFSET:g} m/s^2, here {np.abs(offset).max():.3g}: arming will be refused')
     if np.any((scale < SCALES_ALLOWED[0]) | (scale > SCALES_ALLOWED[1])):
         low, high = SCALES_ALLOWED
-        lines.append(f'ArduPilot takes INS_ACCSCAL from {low:g} to {high:g}, here {scale.min():.3g} to {scale.max():.3g}')
-    return [*lines, 'ArduPilot measures the offsets of gyroscopes anew at each start unless INS_GYR_CAL is 0']
+        lines.append(f'ArduPilot accepts INS_ACCSCAL from {low:g} to {high:g}, here {scale.min():.3g} to {scale.max():.3g}')
+    return [*lines, 'ArduPilot measures the offsets of gyroscopes at each start unless INS_GYR_CAL is 0']
 
 
 TARGETS = (Target(

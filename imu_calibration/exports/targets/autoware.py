@@ -45,7 +45,7 @@ def noise(found: Noise) -> dict:
 def write(page: Page) -> str:
     """Return a parameter file."""
     x, y, z = (float(value) for value in page.numbers[TOPIC])
-    scale = [f'scale factors do not fit into the file; the node takes them from the topic {TOPIC}, to be repeated, since it keeps nothing:',
+    scale = [f'the file has no scale factors; the node reads them from the topic {TOPIC}, published repeatedly:',
              f'  ros2 topic pub -r 1 {TOPIC} geometry_msgs/msg/Vector3Stamped "{{vector: {{x: {x!r}, y: {y!r}, z: {z!r}}}}}"']
     parameters = {name: value for name, value in page.numbers.items() if name != TOPIC} | (page.noise or {})
     switches = {'correct_for_static_bias': True, 'correct_for_dynamic_bias': False, 'correct_for_scale': True}
@@ -67,8 +67,8 @@ def read(content: bytes, _path: str | Path) -> Read:
 
 TARGETS = (Target(
     name='autoware', title='Autoware imu_corrector parameters',
-    formula='rate = (raw - angular_velocity_offset) / gyro_scale_input; specific force as it is\n'
-            'covariances = stddev^2; after the turn to base_link the largest of the three stands for all',
+    formula='rate = (raw - angular_velocity_offset) / gyro_scale_input; specific force unchanged\n'
+            'covariances = stddev^2; after the rotation to base_link the largest of the three is used for all',
     source='autowarefoundation/autoware_universe, sensing/autoware_imu_corrector/src/imu_corrector_core.cpp',
     holds=of('gyroscope', OFFSETS + SCALES), numbers=numbers, corrected=corrected, noise=noise, needs_walk=False,
     noise_is='discrete: standard deviation of a sample', write=write, read=read, imu=imu,

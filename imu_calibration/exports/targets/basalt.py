@@ -72,8 +72,8 @@ def read(content: bytes, _path: str | Path) -> Read:
 
 TARGETS = (Target(
     name='basalt', title='basalt calibration JSON',
-    formula='calibrated = (I + S) raw - b, the bias behind the matrix\n'
-            'accelerometer: b and the lower triangle of S, gyroscope: b and the whole S, by columns',
+    formula='calibrated = (I + S) raw - b, the bias after the matrix\n'
+            'accelerometer: b and the lower triangle of S, gyroscope: b and the full S, by columns',
     source='VladyslavUsenko/basalt-headers, calibration/calib_bias.hpp and calibration.hpp',
     holds=OFFSETS + MATRICES, estimates=THERMAL_OFFSETS, placement=accelerometer_lower, numbers=numbers, corrected=corrected, noise=noise,
     noise_is='continuous, per axis', suffix='.json', write=write, read=read, imu=imu, axes='accelerometer_lower_triangular',

@@ -55,8 +55,8 @@ def _numbers(content):
     except ValueError:
         values = []
     if len(values) != COUNT or not np.all(np.isfinite(values)) or not _invertible(values):
-        raise InputError(f'an imu_tk file must hold {COUNT} numbers, misalignment and scale matrices that can be inverted and a bias, got '
-                         f'{len(words)} words; give another file')
+        raise InputError(f'an imu_tk file must have {COUNT} numbers, misalignment and scale matrices that can be inverted and a bias, got '
+                         f'{len(words)} entries; give a different file')
     return values
 
 
