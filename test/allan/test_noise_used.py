@@ -143,7 +143,7 @@ def test_live_the_measured_noise_is_used_by_the_solution_and_the_diagnosis(noise
 def test_by_hand_the_noise_is_refused_in_one_line(noise_file, tmp_path, capsys):
     assert main(['calibrate', str(BAG), '--noise', str(noise_file), '--output', str(tmp_path / 'out')]) == 1
     error = capsys.readouterr().err
-    assert 'by hand it must be left out' in error and error.count('\n') == 1 and not (tmp_path / 'out').exists()
+    assert '--table' in error and error.count('\n') == 1 and not (tmp_path / 'out').exists()
 
 
 def test_a_noise_file_that_is_none_is_refused_with_its_name(tmp_path, capsys):

@@ -91,7 +91,7 @@ def test_it_is_asked_only_where_the_temperature_turned(cycled):
         gatherer = MotionGatherer(table)
         known, lacking = asked_of(SensorModel(joint_names=tuple(table.joint_names)), table, gatherer.push(session.block) + gatherer.finish())
         assert (set(HYSTERESIS) <= {effect.name for effect in known}) is asked
-        assert asked or {entry['why'] for entry in lacking if entry['effect'] in HYSTERESIS} == {'the temperature did not turn, so that it came one way only'}
+        assert asked or {entry['why'] for entry in lacking if entry['effect'] in HYSTERESIS} == {'the temperature did not reverse: one branch only'}
 
 
 @pytest.mark.parametrize('hidden', ['accel_thermal_hysteresis', 'gyro_thermal_bias'])

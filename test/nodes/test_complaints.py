@@ -84,8 +84,8 @@ def test_the_guide_says_every_change_once(now):
             now[0] += PATIENCE
             said += guide.lines(state)
     assert [line for _, line in said] == [
-        'Imu messages come on /imu from /driver, reliable', 'JointState messages come on /imu from /driver, reliable',
-        'Imu: stamps are those of arrival, about 8 samples at once; regular times at 200 Hz are drawn through them', 'first window gathered',
+        'Imu messages are received on /imu from /driver, reliable', 'JointState messages are received on /imu from /driver, reliable',
+        'Imu: stamps are times of arrival, about 8 samples at once; regular times at 200 Hz are drawn through them', 'first window gathered',
         'unproven; bias: known less well; next: turn about x', 'next: turn about x', 'next: turn about y', 'helps, every parameter is determined; save it with `the command that saves`',
         'diagnosis: the gyroscopes feel gravity', 'harms; residuals are large']
     assert said[-1][0] == 'warning'

@@ -144,7 +144,7 @@ def test_without_the_package_one_line_names_it_and_the_node_goes_on(monkeypatch)
     node = Stand()
     shown = LiveView(node, (HEALTH,), FoxgloveSettings(foxglove=True))
     shown.show(HEALTH, dict)
-    assert not shown.is_on and node.said == [('warning', 'nothing is shown, the node goes on without: a view needs foxglove-sdk, which is '
+    assert not shown.is_on and node.said == [('warning', 'no view, the node continues without it: a view needs foxglove-sdk, which is '
                                               'not installed; install imu_calibration[view]')]
 
 

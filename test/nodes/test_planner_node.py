@@ -106,7 +106,7 @@ def test_a_goal_holds_the_trajectory_and_its_end_is_told_in_words(action):
     goal = Goal()
     command._client.futures[0].done(goal)
     goal.ended.done(SimpleNamespace(result=SimpleNamespace(error_code=-4, error_string='inner is late')))
-    assert complaints == ['a joint left its path (inner is late)']
+    assert complaints == ['a joint left the path (inner is late)']
     command.send(POINTS)
     command._client.futures[1].done(Goal(accepted=False))
     assert complaints[1:] == ['it refused the goal']
@@ -188,10 +188,10 @@ def test_the_worker_waits_until_the_joints_rest_and_not_for_ever():
     worker, driver, said = working(0.5)
     until(lambda: said[1:], 'what it says')
     worker.end()
-    assert not driver.began and said == ['stop', 'the joints must rest before a motion begins, they have not within 0.5 s; see what moves them']
+    assert not driver.began and said == ['stop', 'the joints must rest before a motion begins, they moved for 0.5 s; find the cause']
     worker, driver, said = working(0.5)
     driver.awaits_stop = True   # nobody moves the joints: the controller may be late, which is not complained of
-    until(lambda: worker.doing == 'waiting until the controller must have taken the stop', 'the wait for the stop')
+    until(lambda: worker.doing == 'waiting for the controller to stop', 'the wait for the stop')
     time.sleep(1.0)
     assert not said and not driver.began
     driver.silent = True   # but no joint states at all are

@@ -69,7 +69,7 @@ def test_on_a_full_disk_the_answer_says_which_file_is_safe(tmp_path, monkeypatch
     monkeypatch.setattr(files, 'write_whole', fill)
     whole, answer = place.save(live(), 'new')
     other = place.accumulator if full_for == 'calibration.yaml' else place.calibration
-    state = 'the earlier one there stays whole' if full_for == 'calibration.yaml' else 'there was none before'
+    state = 'the earlier file is unchanged' if full_for == 'calibration.yaml' else 'no earlier file existed'
     assert not whole and f'written: {other}; not written: {tmp_path / full_for} must be writable: No space left on device' in answer and state in answer
     assert place.calibration.read_text() == ('old' if full_for == 'calibration.yaml' else 'new')
     assert place.accumulator.exists() == (full_for == 'calibration.yaml') and place.unsaved(live()) == 7
