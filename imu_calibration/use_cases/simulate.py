@@ -141,8 +141,8 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
     """
     check_names(choices)
     if table is None:
-        raise InputError('a replay requires the motion of the IMU, no table or arm was given; give --table or --urdf (by hand, turns are '
-                         'known from the gyroscope alone)', key='table', code='replay_by_hand')
+        raise InputError('a replay needs the motion of the IMU, no table or arm was given; give one (by hand only the gyroscope '
+                         'measures the turns)', key='table', code='replay_by_hand')
     topics = topics_of(choices)
     given = table_of(table, [recording], topics, gravity=choices.get('gravity'))
     known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration

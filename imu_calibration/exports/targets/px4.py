@@ -95,8 +95,8 @@ def ignored(found: dict) -> list[str]:
     for sensor, ending, nominal in (('accelerometer', 'OFF', 0.0), ('accelerometer', 'SCALE', 1.0), ('gyroscope', 'OFF', 0.0)):
         change = float(np.linalg.norm(vector_of(found, f'{CAL[sensor]}_*{ending}', nominal) - nominal))
         if 0 < change <= UNNOTICED:
-            lines.append(f'PX4 takes {CAL[sensor]}_*{ending} for unchanged when the three together move by {UNNOTICED:g} or less (older '
-                         f'versions 0.001), here they move by {change:.2g} from {nominal:g}: see that your version takes them')
+            lines.append(f'PX4 ignores a change of {CAL[sensor]}_*{ending} if the three together change by {UNNOTICED:g} or less (older '
+                         f'versions 0.001), here they change by {change:.2g} from {nominal:g}: check that your version accepts them')
     return lines
 
 
@@ -107,5 +107,5 @@ TARGETS = (Target(
     source='PX4/PX4-Autopilot, src/lib/sensor_calibration/Accelerometer.{hpp,cpp}, Gyroscope.hpp, temperature_compensation',
     holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS, placement=forward_right_down, numbers=numbers, corrected=corrected,
     write=write, read=read, imu=imu, back=forward_right_down, ignored=ignored,
-    hint='set CAL_ACC0_ID and CAL_GYRO0_ID (TC_A0_ID, TC_G0_ID) to the device ids of these sensors, or PX4 takes no notice;'
+    hint='set CAL_ACC0_ID and CAL_GYRO0_ID (TC_A0_ID, TC_G0_ID) to the device ids of these sensors, or PX4 ignores them;'
          ' the readings must be uncalibrated'),)
