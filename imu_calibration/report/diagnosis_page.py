@@ -7,6 +7,7 @@ import numpy as np
 from imu_calibration.diagnosis.result import Diagnosis, Finding, formula_gain
 from imu_calibration.diagnosis.workflow import DiagnosisResult, beyond_lines
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
+from imu_calibration.report.drawn import Drawn
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, draw
 from imu_calibration.report.numbers import in_unit, people, text
 from imu_calibration.report.overlay import overlay_section, variables
@@ -137,13 +138,13 @@ def _formula(diagnosis, rest):
                            label=f'Residual against the variable of the formula, before and after: {" and ".join(proposal.columns)}')}
 
 
-def draw_finding(diagnosis: Diagnosis, finding: Finding, number: int) -> str:
+def draw_finding(diagnosis: Diagnosis, finding: Finding, number: int) -> Drawn:
     """Return the residual against the cause of a finding, before and after, as SVG."""
     label = f'Residual against the cause, before and after: {finding.effect}'
     return draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis, finding.gain.sensor, finding.against), label=label)
 
 
-def draw_over_time(result: DiagnosisResult) -> str:
+def draw_over_time(result: DiagnosisResult) -> Drawn:
     """Return the size of the residuals over time, before and after the extension, as SVG."""
     return draw('traces', (8.6, 4.2), _OverTime(result.diagnosis.traces, SPAN[result.observations]),
                 label='Residuals over time before and after the extension')

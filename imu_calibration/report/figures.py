@@ -6,6 +6,8 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+from imu_calibration.report.drawn import Drawn
+
 INK, GREY, FAINT, GRID = '#1b2430', '#5c6877', '#98a2b0', '#e3e8ee'
 BEFORE, AFTER = '#c0561b', '#1f66a8'
 AXIS = {'x': '#c44e1d', 'y': '#2b8a57', 'z': '#2566b0'}
@@ -26,9 +28,9 @@ STYLE: Any = {
 NAMESPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
 
 
-def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, label: str) -> str:
+def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, label: str) -> Drawn:
     """
-    Return a figure as SVG for the page.
+    Return a figure as SVG for the page, with the matplotlib figure.
 
     Parameters
     ----------
@@ -43,7 +45,7 @@ def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, 
 
     """
     import matplotlib
-    from markupsafe import Markup, escape
+    from markupsafe import escape
     from matplotlib.figure import Figure
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
@@ -53,7 +55,7 @@ def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, 
         canvas, text = _laid_out(figure), io.StringIO()
         figure.dpi = matplotlib.rcParams['figure.dpi']   # of pictures inside, which the canvas lays out at 72
         canvas.print_svg(text, metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None})
-    return Markup(_inside(text.getvalue(), str(escape(label))))
+        return Drawn(_inside(text.getvalue(), str(escape(label))), figure)
 
 
 def _laid_out(figure):

@@ -7,11 +7,12 @@ from imu_calibration.allan.identify import NoiseIdentification
 from imu_calibration.allan.processes import FLATNESS, FLICKER, RANDOM_WALK, WHITE
 from imu_calibration.allan.terms import predicted
 from imu_calibration.effects.base import SENSORS, UNIT
+from imu_calibration.report.drawn import Drawn
 from imu_calibration.report.figures import AXIS, FAINT, GREY, draw, log_axis
 from imu_calibration.units import NOISE, for_people
 
 
-def draw_curve(result: NoiseIdentification, sensor: str) -> str:
+def draw_curve(result: NoiseIdentification, sensor: str) -> Drawn:
     """Return the Allan deviations of the axes of one sensor as SVG."""
     return draw(f'allan-{sensor}', (8.6, 5.0), _Curves(result, sensor), label=f'Allan deviation of the {sensor} against averaging time')
 

@@ -8,6 +8,7 @@ from imu_calibration.by_hand.hand_plan import HandPlan
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.planner import Plan
+from imu_calibration.report.drawn import Drawn
 from imu_calibration.report.figures import AXIS, FAINT, GREY, draw, log_axis
 
 KIND = {MotionKind.POSE: '#2b8a57', MotionKind.RETURN: '#7fbf9a', MotionKind.SPIN: '#1f66a8', MotionKind.SWING: '#d08a12',
@@ -21,7 +22,7 @@ def draw_motion(plan: Plan) -> str:
     return draw('plan-motion', (8.6, 3.6), lambda figure: _motion(figure, plan), label='Positions of the joints against time')
 
 
-def draw_progress(plan: Plan) -> str:
+def draw_progress(plan: Plan) -> Drawn:
     """Return the standard deviations in tolerances against time as SVG, one line for each parameter."""
     return draw('plan-progress', (8.6, 4.2), lambda figure: _progress(figure, plan), label='Predicted standard deviations against time')
 

@@ -8,6 +8,7 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.window_errors import WindowErrors
 from imu_calibration.effects.base import SENSORS, UNIT
+from imu_calibration.report.drawn import Drawn
 from imu_calibration.report.figures import AXIS, GREY, MARKER, axis_legend, draw
 from imu_calibration.report.numbers import in_unit, text
 from imu_calibration.units import for_people
@@ -28,7 +29,7 @@ def residual_section(result: CalibrationResult, errors: WindowErrors) -> dict[st
             'errors': error_rows(errors)}
 
 
-def draw_windows(errors: WindowErrors, sensor: str) -> str:
+def draw_windows(errors: WindowErrors, sensor: str) -> Drawn:
     """Return the errors of one sensor in every window, before and after, as SVG."""
     label = f'Errors of the {sensor} in every window, before and after calibration'
     return draw(f'residuals-{sensor}', (8.6, 4.4), _Windows(errors, sensor), label=label)

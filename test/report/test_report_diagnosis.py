@@ -16,11 +16,12 @@ from imu_calibration.diagnosis.workflow import diagnose_recording
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.effects.term import term
 from imu_calibration.reference.table import Table
-from imu_calibration.report.diagnosis_page import cause_of, chance, diagnosis_report, explained_share, variables
+from imu_calibration.report.diagnosis_page import cause_of, chance, diagnosis_report, draw_finding, explained_share, variables
 from imu_calibration.samples import SampleBlock
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.use_cases.drawing import Drawing
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
                                        {'name': 'inner', 'axis': [1, 0, 0]}],
@@ -62,6 +63,19 @@ def test_it_is_drawn_against_its_cause(result):
     finding = result.diagnosis.findings[0]
     assert finding.gain.sensor == 'gyroscope'
     assert cause_of(result.diagnosis, finding.gain.sensor, finding.against)[1].startswith('specific force')
+
+
+def test_a_figure_is_svg_pdf_axes_and_arrays(result, tmp_path):
+    drawing = Drawing(draw_finding(result.diagnosis, result.diagnosis.findings[0], 1))
+    for name, head in (('p.pdf', b'%PDF-1.4'), ('p.svg', b'<svg ')):
+        drawing.save(tmp_path / name)
+        assert (tmp_path / name).read_bytes().startswith(head)
+    assert drawing.svg.pdf == drawing.svg.pdf
+    left, right = drawing.data
+    axis, _, values = cause_of(result.diagnosis, 'gyroscope', ('force',))
+    np.testing.assert_array_equal(left['lines'][0][1], values)
+    np.testing.assert_allclose(right['lines'][0][2], np.rad2deg(result.diagnosis.traces.after['gyroscope'][:, axis]), rtol=1e-12)
+    assert left['x'].startswith('specific force') and [axes.get_xlabel() for axes in drawing.axes] == [left['x'], right['x']]
 
 
 def test_a_joint_goes_by_its_name(result):
