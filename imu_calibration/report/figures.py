@@ -9,9 +9,9 @@ from typing import Any
 from imu_calibration.report.drawn import Drawn
 
 INK, GREY, FAINT, GRID = '#1b2430', '#5c6877', '#98a2b0', '#e3e8ee'
-BEFORE, AFTER = '#c0561b', '#1f66a8'
-AXIS = {'x': '#c44e1d', 'y': '#2b8a57', 'z': '#2566b0'}
-"""Colours of the three axes, everywhere the same."""
+BEFORE, AFTER = '#d55e00', '#0072b2'
+AXIS = {'x': '#d55e00', 'y': '#009e73', 'z': '#0072b2'}
+"""Colours of the three axes: vermilion, bluish green and blue of Okabe and Ito, distinct for colour-blind readers."""
 STATUS = {'determined': '#2b8a57', 'weak': '#d08a12', 'held': '#b4322c'}
 MARKER = {'static': 'o', 'spin': 's', 'dynamic': '^', 'turn': 's'}
 STYLE: Any = {
