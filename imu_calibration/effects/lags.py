@@ -77,6 +77,8 @@ First-order filter, pure delay and second-order filter of each sensor; what is a
 
 CLOCK = 'time_offset'
 """What both sensors lag by alike: of the clocks."""
+CLOCKS = frozenset({'clock_rate'})
+"""Lags of both sensors that change with time."""
 FAMILY = frozenset({CLOCK, *(effect.name for effect in LAGS)})
 """Effects with one first derivative."""
 

@@ -82,6 +82,10 @@ def _late(table, motion, values):
     return [(1.0, table, shifted(motion, values[0]))]
 
 
+def _late_with_time(table, motion, values):
+    return [(1.0, table, shifted(motion, values[0] * motion.time))]
+
+
 def _earth(values, point):
     """Coefficients of the attitude columns: matrix_ij C_jk earth_k."""
     matrix = values['matrix'].reshape(3, 3)
@@ -180,6 +184,12 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             tolerance=1e-4, tolerance_reason='0.1 mrad at 1 rad/s', prior_sd=0.1,
             plausible=(('bench', 0.05, 'field catalogue 6.3: 1-20 ms on serial paths'),),
             motion=('oscillate_fast', 'two_axis'), compensation='none', warp=_late, needs=('joints', 'dynamic'), step=2e-4),
+        Effect(
+            name='clock_rate', sensor='reference', components=('rate',), shape=(), unit='s/s', nuisance=True, against=('time',),
+            explanation='The clock of the IMU stamps runs at another rate than that of the joint stamps: the lag grows linearly with time.',
+            tolerance=1e-6, tolerance_reason='0.6 ms in 10 min', prior_sd=1e-3,
+            plausible=(('bench', 5e-4, 'crystal oscillators: 10-100 ppm over temperature'),),
+            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=_late_with_time, needs=('joints', 'dynamic'), step=1e-6),
         Effect(
             name='earth_rate', sensor='reference', components=('x', 'y', 'z'), shape=(3,), unit='rad/s', nuisance=True,
             title='Earth rate in the level frame', known_size=True, moot=_earth_known,

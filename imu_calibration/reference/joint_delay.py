@@ -1,4 +1,4 @@
-"""The motion of the joints a moment earlier or later, from its values and derivatives at the stamps."""
+"""The motion of the joints at shifted times, from its values and derivatives at the stamps."""
 
 from dataclasses import replace
 from math import factorial
@@ -14,7 +14,7 @@ BLOCK = 4096
 """Rows per block, so that they fit in the processor's cache."""
 
 
-def shifted(motion: JointMotion, delay: float) -> JointMotion:
+def shifted(motion: JointMotion, delay: float | np.ndarray) -> JointMotion:
     """
     Return the motion at ``time - delay``, with unchanged `time`: the motion of the IMU if its stamps are `delay` late.
 
@@ -26,21 +26,22 @@ def shifted(motion: JointMotion, delay: float) -> JointMotion:
     ----------
     motion : JointMotion
         Motion at the stamps.
-    delay : float
-        Seconds; positive when the IMU's stamps are late.
+    delay : float or array, shape (n,)
+        Delay of all stamps, or of each, s; positive if the stamps of the IMU are late.
 
     """
-    if delay == 0 or not len(motion):
+    if not np.any(delay) or not len(motion):
         return motion
+    delay = np.broadcast_to(np.asarray(delay, float), motion.time.shape)
     derivatives = np.stack([motion.position, motion.rate, motion.acceleration, motion.jerk])
     step = np.diff(motion.time)
     if len(motion) < 2 or np.any(step <= 0):
-        moved = _taylor(derivatives, -delay)
+        moved = _taylor(derivatives, -delay[:, None])
     else:
         target, moved = motion.time - delay, np.empty_like(derivatives)
         for first in range(0, len(target), BLOCK):
             rows = slice(first, first + BLOCK)
-            moved[:, rows] = _interpolated(motion.time, step, derivatives, target[rows], delay > 0)
+            moved[:, rows] = _interpolated(motion.time, step, derivatives, target[rows], delay[rows] > 0)
     return replace(motion, position=moved[0], rate=moved[1], acceleration=moved[2], jerk=moved[3])
 
 
@@ -56,8 +57,8 @@ def _interpolated(time, step, derivatives, target, backwards):
     moved[:, inside] = between
     beyond = np.flatnonzero(~inside)
     # The end of the run that contains the stamp: an isolated stamp, of a rest, is its own run.
-    base = np.searchsorted(time, target[beyond], side='left') if backwards else np.searchsorted(time, target[beyond], side='right') - 1
-    base = np.clip(base, 0, len(time) - 1)
+    before, after = (np.searchsorted(time, target[beyond], side=side) for side in ('left', 'right'))
+    base = np.clip(np.where(backwards[beyond], before, after - 1), 0, len(time) - 1)
     moved[:, beyond] = _taylor(derivatives[:, base], (target[beyond] - time[base])[:, None])
     return moved
 

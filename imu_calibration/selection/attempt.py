@@ -115,7 +115,7 @@ class Attempt:
         """Return what the evidence makes of an effect's curvature, nats: how well it is told from its own first derivative."""
         without = self.search.used([q for q in chosen if q is not question])
         weight = self.evidence.loss(without) - self.evidence.loss(self.search.used(chosen))
-        return weight * _curvature(question, self.values(chosen), self.recording.model)**2
+        return weight * _curvature(question, self.values(chosen), self.recording.model, self.constants[-1] / 2)**2
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """
@@ -217,13 +217,13 @@ def _at_baseline(recording, baseline, used):
     return recording
 
 
-def _curvature(question, values, model):
+def _curvature(question, values, model, duration):
     """Return the relative error of the first derivative at the size of the effect."""
     effect = question.effect
     value = values[list(question.parameters)]
     if effect.warp is not None:
         moved = np.max(np.abs(value - model.point_of(effect)))
-        return moved * (FASTEST if effect.unit == 's' else 1.0)
+        return moved * {'s': FASTEST, 's/s': FASTEST * duration}.get(effect.unit, 1.0)
     if effect.time_constant:
         return abs(np.log(max(value[-1], 1e-3) / model.point_of(effect)[-1]))
     return BILINEAR

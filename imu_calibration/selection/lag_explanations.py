@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.lags import CLOCK, FAMILY, lag_name
+from imu_calibration.effects.lags import CLOCK, CLOCKS, FAMILY, lag_name
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.questions import Question, point_with
@@ -46,8 +46,9 @@ class Told:
 
     @property
     def values(self) -> dict[str, float]:
-        """Parameter of the baseline and of the lags -> value."""
-        names = {*self.attempt.baseline.param_names, *(name for q in self.chosen if q.name in FAMILY for name in q.effect.param_names())}
+        """Parameter of the baseline, of the lags and of clocks that change -> value."""
+        lags = FAMILY | CLOCKS
+        names = {*self.attempt.baseline.param_names, *(name for q in self.chosen if q.name in lags for name in q.effect.param_names())}
         return {name: value for name, value in zip(self.attempt.space.names, self.attempt.values(self.chosen)) if name in names}
 
     def lags(self, sensor: str) -> tuple[np.ndarray, np.ndarray]:
@@ -72,7 +73,7 @@ class Explanation:
     cost: float
     """Held-out cost, nats, penalties included."""
     values: dict[str, float] = field(default_factory=dict)
-    """Parameter of the baseline -> value."""
+    """Parameter of the baseline and of clocks that change -> value."""
 
     @property
     def rank(self) -> tuple:
@@ -129,9 +130,10 @@ def lag_explanations(attempt: Attempt, chosen: Sequence[Question], attempted: Ca
     effects = {effect.name: effect for effect in attempt.effects}
     if not {question.name for question in chosen} & FAMILY or not FAMILY <= set(effects):
         return None
-    described = _described(attempted, effects, rest)
+    described = _described(attempt, attempted, effects, rest=rest, clocks=_clocks(attempt, chosen))
     judges = [each.attempt for each in described]
-    explanations = _explanations(described, judges, attempt.baseline.param_names)
+    names = [name for name in described[0].values if name.split('.')[1] not in FAMILY]
+    explanations = _explanations(described, judges, names)
     if not explanations:
         return None
     return LagExplanations(attempt, explanations, rest, _silence(described, judges) if attempt.recording.moving.all() else None)
@@ -158,11 +160,17 @@ def simplest(explanations: Sequence[Explanation], silent: float | None = None) -
     return simplest(common) if common else told
 
 
-def _described(attempted, effects, rest):
-    """Return the Told of each kind; of the first alone where no curvature can show."""
-    def at(kind, values=None):
+def _clocks(attempt, chosen):
+    """Return parameter -> value of the chosen clocks that change, None without one: their lags are far from a linear model at zero."""
+    values, clocks = attempt.values(chosen), [question for question in chosen if question.name in CLOCKS]
+    return {attempt.space.names[k]: float(values[k]) for question in clocks for k in question.parameters} or None
+
+
+def _described(attempt, attempted, effects, *, rest, clocks):
+    """Return the description of each kind; the first alone if no curvature is observable."""
+    def at(kind, values=clocks):
         asked = [effects[lag_name(sensor, ending)] for ending in kind for sensor in SENSORS] + [question.effect for question in rest]
-        there = attempted(effects=asked, point=None if values is None else point_with(first.attempt.baseline, asked, values))
+        there = attempted(effects=asked, point=None if values is None else point_with(attempt.baseline, asked, values))
         lags = [q for ending in kind for sensor in SENSORS for q in there.questions if q.name == lag_name(sensor, ending)]
         return Told(kind, there, [*lags, *same_questions(there, rest)])
 

@@ -20,7 +20,7 @@ from worlds.physics_draw import EFFECTS
 
 OPTIONS = {'profile': 'random_short', 'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0}
 LEFT = {'load_compliance': 3e-3, 'axis_wobble': 3e-3, 'accel_scale_asymmetry': 5e-3, 'gyro_scale_asymmetry': 5e-3, 'accel_bandwidth': 0.02, 'gyro_bandwidth': 0.02,
-        'accel_cross_axis_lag': 0.03, 'gyro_cross_axis_lag': 0.03, 'time_offset': 2e-3,
+        'accel_cross_axis_lag': 0.03, 'gyro_cross_axis_lag': 0.03, 'time_offset': 2e-3, 'clock_rate': 2e-3,
         'accel_thermal_hysteresis': 0.1, 'gyro_thermal_hysteresis': 0.1, 'accel_vibration_rectification': 0.3, 'gyro_vibration_rectification': 0.3}
 """
 Share of the effect that may remain: the catalogue's signs near zero input, its quadrature and Taylor series; the mount's turn to first order; the world's differences

@@ -64,3 +64,14 @@ def test_one_row_and_rows_out_of_order_take_the_series_of_their_own():
     np.testing.assert_allclose(late.position, true.position, atol=1e-9)
     alone = shifted(oscillation(time[:1], 1.0), 1e-3)
     np.testing.assert_array_equal(alone.position, late.position[:1])
+
+
+def test_each_stamp_may_have_its_own_delay():
+    """Where delays of a step are constant the motion is that of either; of one sample only the own delay counts."""
+    time = np.cumsum(np.random.default_rng(1).uniform(0.009, 0.011, 100))
+    motion, delay = oscillation(time, 2.0), np.where(time > time[60], 0.012, -0.004)
+    late, parts = shifted(motion, delay), [shifted(motion, value) for value in (0.012, -0.004)]
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(late, name), np.where((delay > 0)[:, None], *(getattr(part, name) for part in parts)))
+    alone = oscillation(time[:1], 2.0)
+    np.testing.assert_array_equal(shifted(alone, delay[:1]).position, shifted(alone, -0.004).position)

@@ -144,7 +144,7 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
 
     clock = generator(seed, 'clock')
     start_ns = 1_700_000_000_000_000_000 + int(clock.integers(10**12))
-    stamp_ns = start_ns + to_ns(sampling.time + values.get('time_offset', 0.0) + cause.stamped(sampling.time, generator(seed, 'driver')))
+    stamp_ns = start_ns + to_ns(sampling.time + values.get('time_offset', 0.0) + values.get('clock_rate', 0.0) * sampling.time + cause.stamped(sampling.time, generator(seed, 'driver')))
     imu = ImuSamples(jitter_stamps(stamp_ns, model.stamp_jitter, clock), *outputs, 'imu_link')
     joints = _read_joints(mapping, moves, values, model, joint_rate, velocity, start_ns, cause, generator(seed, 'encoders'))
     published = climate.publish(start_ns, moves.duration, generator(seed, 'thermometer')) if temperature else None

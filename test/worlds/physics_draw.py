@@ -27,7 +27,7 @@ EFFECTS = {
     'gyro_scale_asymmetry': (1e-3, (3,)), 'gyro_thermal_bias': (0.01 * DEG, (3,)), 'gyro_thermal_scale': (5e-4, (3,)),
     'gyro_bias_drift': (0.05 * DEG, None), 'gyro_saturation': (0.02, None), 'gyro_bandwidth': (4e-3, None),
     'table_tilt': (5 * ARCMIN, (2,)), 'axis_non_orthogonality': (5 * ARCMIN, None), 'encoder_zero': (5 * ARCMIN, None),
-    'encoder_harmonic': (3 * ARCMIN, None), 'time_offset': (2e-3, ()), 'earth_rate': (1.0, None),
+    'encoder_harmonic': (3 * ARCMIN, None), 'time_offset': (2e-3, ()), 'clock_rate': (2e-5, ()), 'earth_rate': (1.0, None),
 }
 """Effects that can be hidden: name -> (clearly visible size, shape of its value or None)."""
 OUTSIDE = {'angle_bias_accel': 2 * MG, 'angle_bias_gyro': 0.05 * DEG, 'stop_bias': 2 * MG, 'knock_step': 5 * MG,
