@@ -39,8 +39,8 @@ PASSES = 4
 """Solutions at most, when the columns of a warm-up have to be taken anew or poses and turns are left out."""
 SETTLED = 0.03
 """Relative change of a time constant below which its columns stay."""
-POSES_FULL = 9
-"""The nine accelerometer parameters take one equation per attitude."""
+POSES_FULL = 12
+"""The nine accelerometer parameters take one equation per attitude; the others estimate the scatter of the poses."""
 
 
 @dataclass(frozen=True, eq=False)

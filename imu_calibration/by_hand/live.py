@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.by_hand.calibrate import POSES_LEAST
+from imu_calibration.by_hand.calibrate import POSES_FULL, POSES_LEAST
 from imu_calibration.by_hand.model import HandModel
 from imu_calibration.by_hand.next_pose import hand_coverage
 from imu_calibration.by_hand.options import hand_options
@@ -34,7 +34,7 @@ SEARCH_SHARE = 0.05
 """Share of the time that looking for rest takes at most: after an hour at 200 Hz it is looked for every ten seconds or so."""
 SEARCH_STEP = 0.5
 """Rest is looked for after so many seconds of new samples, at the earliest."""
-_FIRST_NEEDS = {'accelerometer': 'hold it still in many attitudes',
+_FIRST_NEEDS = {'accelerometer': f'hold it still in {POSES_FULL} different attitudes',
                 'gyroscope': 'turn it from one attitude to the next, within half a minute'}
 MOST_POSES = 200
 """The time of the joint estimate grows with the third power of their number; the oldest are forgotten."""

@@ -1,4 +1,4 @@
-"""How far standard deviations by hand must allow for more than noise: the same look at stretches of the recording as on a table."""
+"""Model error of a calibration by hand: parameters of parts of the recording differ by more than noise, tested as on a table."""
 
 import numpy as np
 import scipy.linalg
@@ -35,6 +35,9 @@ def hand_model_error(model: HandModel, state: State, poses: Poses, *, turns: lis
     if count < LEAST_BLOCKS or not free.any():
         return ModelError(np.ones(model.size), *np.zeros((2, model.size)))
     system = build_system(model, state, poses, turns=turns)
+    spare = np.isin(system.component, (0, 2)).sum() - 2 * count - free.sum() + free[GYRO_BIAS].sum()
+    if spare < LEAST_BLOCKS:   # parts that are fitted almost exactly have no scatter to compare
+        return ModelError(np.ones(model.size), *np.zeros((2, model.size)))
     root = np.sqrt(scatter.total(system.noise, system.component))
     along, rest = system.nuisance / root[:, None], system.residual / root
     fitted, _ = scipy.linalg.qr(along, mode='economic')

@@ -123,7 +123,7 @@ def first_state(model: HandModel, poses: Poses) -> State:
 def _iterate(model, state, poses, turns, free, priors, variance, fallback, memory):
     """Repeat steps and scatter estimates until neither moves."""
     count = len(poses.start)
-    scatter = GroupVariances(np.array(variance, float), np.full(len(fallback), np.inf))
+    scatter = GroupVariances(np.array(variance, float), np.full(len(fallback), np.inf), np.array(variance, float))
     for number in range(1, ITERATIONS + 1):
         system = build_system(model, state, poses, turns=turns, memory=memory)
         design = np.vstack([np.hstack([system.nuisance, system.main[:, free]]),

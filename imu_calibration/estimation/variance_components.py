@@ -1,16 +1,24 @@
-"""Variances that come on top of known noise in groups of rows of a linear system, by restricted maximum likelihood."""
+"""Variances in excess of known noise in groups of rows of a linear system, by restricted maximum likelihood."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 
-from imu_calibration.estimation.noise_model import dof_factor
 from imu_calibration.estimation.restricted_likelihood import RestrictedLikelihood
 
 STEPS = 2
 """Scoring steps per call; for rows of one variance a single step is exact."""
 DOF_LEAST = 2.0
 """With fewer degrees of freedom a group's variance is not estimated from the data."""
+DOF_SEPARATE = 3.0
+"""With fewer degrees of freedom the misfit of a group is not separable from that of the others."""
+ATTRIBUTION_STEPS = 6
+"""Scoring steps for the variance of one group if all misfit is its own."""
+SPARE_LEAST = 0.1
+"""With fewer degrees of freedom no misfit is attributed to a group."""
+UPPER = 0.975
+"""Probability of the quantile whose ratio between Student's t and the normal distribution widens standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +29,8 @@ class GroupVariances:
     """Additional variance of each group, shape (n_groups,)."""
     dof: np.ndarray
     """Degrees of freedom from which each was estimated, shape (n_groups,)."""
+    upper: np.ndarray
+    """Variance for standard deviations, which allows for the error of `variance`, shape (n_groups,)."""
 
     def total(self, noise: np.ndarray, group: np.ndarray, inflated: bool = False) -> np.ndarray:
         """
@@ -33,12 +43,10 @@ class GroupVariances:
         group : array, shape (m,)
             Group of each row, -1 for none.
         inflated : bool
-            Take it larger as far as it was itself estimated from few data (`noise_model.dof_factor`), so that intervals from few poses
-            hold.
+            Use `upper`, so that 95 % intervals from few poses are correct.
 
         """
-        factor = np.where(self.dof > DOF_LEAST, dof_factor(self.dof), 1.0) if inflated else 1.0
-        return noise + np.append(self.variance * factor, 0.0)[group]
+        return noise + np.append(self.upper if inflated else self.variance, 0.0)[group]
 
 
 def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np.ndarray, *, group: np.ndarray, start: np.ndarray,
@@ -63,9 +71,10 @@ def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np
     """
     rows = np.column_stack([design, residual])[:, None]
     problem = _Groups(RestrictedLikelihood(rows, np.zeros(len(rows)), [np.arange(len(rows))]), noise, group, len(start))
-    # at a large variance only the layout of the rows counts: can they tell it at all?
+    # at a large variance the degrees of freedom depend on the layout of the rows only
     none, large = np.zeros(len(start), bool), 100 * (np.asarray(fallback, float) + problem.typical(np.zeros(len(start))))
-    free = problem.step(large, none)[1] >= DOF_LEAST
+    spare = problem.step(large, none)[1]
+    free = spare >= DOF_LEAST
     current = np.where(free, start, fallback)
     for _ in range(STEPS):
         typical, (changed, dof) = problem.typical(current), problem.step(current, free)
@@ -73,7 +82,26 @@ def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np
         current = changed
         if settled:
             break
-    return GroupVariances(current, np.where(free, dof, 0.0))
+    dof = np.where(free, dof, 0.0)
+    upper = current * np.where(dof > DOF_LEAST, student_factor(dof), 1.0)
+    for alone in np.eye(len(free), dtype=bool)[spare < DOF_SEPARATE]:
+        upper[alone] = np.maximum(upper[alone], _attributed(problem, alone, fallback)[alone])
+    return GroupVariances(current, dof, upper)
+
+
+def student_factor(dof: np.ndarray) -> np.ndarray:
+    """Return the squared ratio of the 97.5 % quantiles of Student's t with `dof` (at least 1) degrees of freedom and of the normal law."""
+    return (stdtrit(np.maximum(dof, 1.0), UPPER) / ndtri(UPPER))**2
+
+
+def _attributed(problem, alone, fallback):
+    """Return the variance of one group if all misfit is its own, at least `fallback`, widened by Student's t, shape (n_groups,)."""
+    least = np.where(alone, fallback, 0.0)
+    current, dof = problem.step(least, np.zeros(len(alone), bool))
+    for _ in range(ATTRIBUTION_STEPS if dof[alone] > SPARE_LEAST else 0):
+        current = problem.step(current, alone)[0]
+    current = np.where(alone, np.maximum(current, fallback), 0.0)
+    return current * student_factor(problem.step(current, np.zeros(len(alone), bool))[1])
 
 
 class _Groups:

@@ -28,7 +28,7 @@ def reference_of(table: Table | None, named: str) -> SessionReference:
     """Return the reference that a table or an arm with this name is; None: gravity alone."""
     if table is None:
         return SessionReference(None, "by hand, since neither 'table_file' nor 'urdf_file' was given: "
-                                "hold the IMU still in many attitudes and turn it in between",
+                                "hold the IMU still in 12 different attitudes and turn it in between",
                                 lambda options, live, by_hand, saved: LiveByHand(options, live, by_hand, saved=saved))
     return SessionReference(table.joint_names, f'on {named} with the joints {", ".join(table.joint_names)}',
                             lambda options, live, by_hand, saved: LiveCalibration(table, options, live, saved=saved))
