@@ -68,7 +68,7 @@ class LiveByHand:
 
     def __init__(self, options: CalibrationOptions, settings: LiveSettings, by_hand: LiveByHandSettings = LiveByHandSettings(), *,
                  saved: bytes | None = None, clock: Callable[[], float] = time.monotonic):
-        self.options, self.settings, self._clock = replace(options, gravity=by_hand.gravity or None), settings, clock
+        self.options, self.settings, self._clock = by_hand.at_place(options), settings, clock
         self._asked = hand_options(self.options)
         _check_model(self.model)
         self._check, self._store, self._drops = StreamCheck(), HandStore(by_hand.hand_samples), {}
@@ -102,8 +102,8 @@ class LiveByHand:
         self._search(self._store)
 
     def change_by_hand(self, by_hand: LiveByHandSettings) -> None:
-        """Take another gravity, or another number of samples to keep."""
-        self.options = replace(self.options, gravity=by_hand.gravity or None)
+        """Use another gravity, or keep another number of samples."""
+        self.options = by_hand.at_place(self.options)
         self._store.most = by_hand.hand_samples
 
     @property

@@ -88,6 +88,6 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
     if options.gravity is not None and not GRAVITY_LEAST <= options.gravity <= GRAVITY_MOST:
         raise InputError(f'gravity must be {GRAVITY_LEAST} to {GRAVITY_MOST} m/s^2, which covers the surface of the Earth, '
                          f'got {options.gravity:g}; give the local gravity in m/s^2, or none', key='gravity')
-    gravity, spread = (STANDARD_GRAVITY, STANDARD_GRAVITY_SD) if options.gravity is None else (options.gravity, 0.0)
+    gravity, spread = (STANDARD_GRAVITY, STANDARD_GRAVITY_SD) if options.gravity is None else (options.gravity, options.gravity_sd)
     return HandOptions(gravity, spread, tolerances=options.tolerances, accelerometer=accelerometer, gyroscope=gyroscope,
                        catalogue=options.catalogue)

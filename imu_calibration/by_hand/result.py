@@ -69,10 +69,10 @@ class HandResult(CalibrationResult):
         """Return noise and gravity: there is no other reference. The sds contain the uncertainty of a gravity that was not given."""
         model, values, sd = self.calibration.model, self.calibration.values, self.calibration.sd
         known = self.options.gravity is not None
-        gravity_sd = errors.gravity if known else STANDARD_GRAVITY_SD
+        gravity_sd = (self.options.gravity_sd or errors.gravity) if known else STANDARD_GRAVITY_SD
         part, gravity = model.part('accelerometer', Role.LINEAR), np.zeros(len(sd))
         gravity[part] = np.abs(values[part]) * gravity_sd / self.gravity
-        noise = sd if known else np.sqrt(np.maximum(sd**2 - gravity**2, 0.0))
+        noise = sd if known and not self.options.gravity_sd else np.sqrt(np.maximum(sd**2 - gravity**2, 0.0))
         return ErrorBudget(tuple(model.param_names), {'noise': noise, 'gravity': gravity},
                            {'noise': 'noise, scatter of poses and turns, as this recording shows them',
                             'gravity': f'gravity {"known" if known else "not given: the standard one is known"} to {gravity_sd:.2g} m/s²'})

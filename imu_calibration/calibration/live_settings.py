@@ -1,7 +1,9 @@
 """What a calibration that goes on solves, keeps and tells, and what it takes where no table is the reference."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.reference.earth import local_gravity
 from imu_calibration.settings import setting
 
 
@@ -27,11 +29,21 @@ class LiveSettings:
 
 @dataclass(frozen=True)
 class LiveByHandSettings:
-    """What a calibration by hand keeps, and its reference."""
+    """Reference and memory of a calibration by hand."""
 
     gravity: float = setting(0.0, 'm/s^2', 'local gravity, used without a table; 0: the standard gravity, which may be off by 0.02',
                              (0.0, 30.0), 'all three accelerometer scales are wrong together',
                              live=True, session=True)
+    latitude: float = setting(100.0, 'deg', 'latitude, used without a table if gravity is 0 (WGS 84 normal gravity); above 90: unknown',
+                              (-90.0, 100.0), 'as with a wrong gravity', live=True, session=True)
+    height: float = setting(0.0, 'm', 'height above the ellipsoid, used with latitude', (-500.0, 9000.0), '3e-6 m/s^2 of gravity per metre',
+                            live=True, session=True)
     hand_samples: int = setting(800_000, '1', 'Imu samples kept without a table, about 60 bytes each (800000: over an hour at 200 Hz); '
                                 'beyond them the inside of the longest rest is forgotten, then the oldest', (2000, 100_000_000),
                                 'too small: poses are dropped, see diagnostics', live=True)
+
+    def at_place(self, options: CalibrationOptions) -> CalibrationOptions:
+        """Return the options with the gravity of these settings and its standard deviation."""
+        known = self.gravity or self.latitude > 90
+        gravity, spread = local_gravity(self.gravity or None) if known else local_gravity(None, self.latitude, self.height)
+        return replace(options, gravity=gravity, gravity_sd=spread)

@@ -44,6 +44,8 @@ class CalibrationOptions:
     """(sensor, effect) that a recording demands on top."""
     point: dict[str, np.ndarray] = field(default_factory=dict)
     """Effect -> values at which columns are taken first."""
+    gravity_sd: float = 0.0
+    """Standard deviation of `gravity`, m/s^2."""
 
     @property
     def bias_processes(self) -> dict[str, tuple[BiasProcess, ...]]:

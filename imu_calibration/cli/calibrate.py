@@ -15,6 +15,8 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_argument('bags', nargs='+', metavar='BAG', help=arguments.BAG)
     common('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
     common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
+    common('--latitude', metavar='DEG', type=float, help='in place of --gravity: WGS 84 normal gravity at this latitude')
+    common('--height', metavar='M', type=float, help='height above the ellipsoid for --latitude, m; default 0')
     expert('--earlier', metavar='FILE', help='calibration.yaml from before, proven on the same recordings (with a table)')
     common('--no-report', action='store_true', help='write calibration.yaml only')
     expert('--jobs', type=int, help='recordings read at a time, default one per core')

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from imu_calibration.errors import InputError
+
 EARTH_RATE = 7.292115e-5
 """Rate of the Earth against inertial space, rad/s (WGS 84)."""
 
@@ -36,6 +38,40 @@ def normal_gravity(latitude_deg: float, height: float = 0.0) -> float:
     ratio = np.asarray(height, float) / _SEMI_MAJOR_AXIS
     value = surface * (1 - 2 * (1 + _FLATTENING + _ROTATION_RATIO - 2 * _FLATTENING * sin2) * ratio + 3 * ratio ** 2)
     return value if np.ndim(value) else float(value)
+
+
+def local_gravity(gravity: float | None, latitude_deg: float | None = None, height: float | None = None) -> tuple[float | None, float]:
+    """
+    Return (gravity, its standard deviation), m/s^2: as given, else the normal gravity of the place; (None, 0.0) without either.
+
+    Parameters
+    ----------
+    gravity : float or None
+        Measured gravity, m/s^2; its standard deviation is taken as zero.
+    latitude_deg : float or None
+        Geodetic latitude, degrees.
+    height : float or None
+        Height above the ellipsoid, m; 0 if not given.
+
+    Raises
+    ------
+    InputError
+        If gravity and latitude are both given, a height has no latitude, or the place is not on the Earth.
+
+    """
+    if latitude_deg is None:
+        if height is not None:
+            raise InputError(f'height must come with a latitude, got height {height:g} m alone; give both, or gravity in m/s^2',
+                             key='latitude', code='latitude_missing')
+        return gravity, 0.0
+    if gravity is not None:
+        raise InputError(f'the place or gravity must be given, got latitude {latitude_deg:g} deg and gravity {gravity:g} m/s^2; omit one',
+                         key='latitude', code='gravity_twice')
+    if not (abs(latitude_deg) <= 90 and -500 <= (height or 0.0) <= 9000):
+        raise InputError(f'the place must have a latitude of -90 to 90 deg and a height of -500 to 9000 m, got {latitude_deg:g} deg and '
+                         f'{height or 0.0:g} m; correct them', key='latitude', code='place_impossible')
+    value = normal_gravity(latitude_deg, height or 0.0)
+    return value, NORMAL_GRAVITY_ACCURACY * value
 
 
 def earth_rate_n(latitude_deg: float, azimuth_deg: float) -> np.ndarray:

@@ -112,7 +112,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
         raise InputError('an earlier calibration must be compared on a table, none was given; give its description', key='table',
                          code='table_missing')
     recordings = [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
-    stand, table = table, None if table is None else table_of(table, recordings, topics, gravity=choices.get('gravity'))
+    stand, table = table, None if table is None else table_of(table, recordings, topics, gravity=options.gravity)
     joints = None if table is None else table.joint_names
     for path in recordings:
         if not isinstance(path, SampleBlock):

@@ -77,7 +77,7 @@ def check(recording: str | PathLike | SampleBlock, calibration: Calibration | st
         return Checked(result, (*_gravity(options, calibration), *_notes(recording, calibration)))
     if not isinstance(recording, SampleBlock):
         open_bag(recording, topics, want_joints=True).close()
-    table = table_of(table, [recording], topics, gravity=choices.get('gravity'))
+    table = table_of(table, [recording], topics, gravity=options.gravity)
     source = source_of(recording, topics, table.joint_names)
     result = check_on_table([source], table, calibration, options=options, names=[name_of(recording)])
     return Checked(result, _notes(recording, calibration))

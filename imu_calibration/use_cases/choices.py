@@ -10,6 +10,7 @@ from imu_calibration.calibration.document import checked_tolerances
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.errors import InputError
+from imu_calibration.reference.earth import local_gravity
 from imu_calibration.resources import config_file
 from imu_calibration.samples import NominalScaling
 from imu_calibration.segmentation.window_settings import WindowSettings
@@ -36,6 +37,10 @@ class Choices(TypedDict, total=False):
     """Effects of table and clock joined by +, or 'none'; default table_tilt, and earth_rate when only the azimuth is unknown."""
     gravity: float | None
     """Local gravity for work by hand or with a robot description, m/s^2; default the standard gravity with its uncertainty."""
+    latitude: float | None
+    """Geodetic latitude, degrees, from which gravity follows (WGS 84) where it is not given."""
+    height: float | None
+    """Height above the ellipsoid, m; default 0."""
     model_as_asked: bool
     """Whether nothing is added to the model whatever the recording demands; default no."""
     tolerances: str | PathLike | Mapping | None
@@ -72,10 +77,11 @@ def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
     catalogue = catalogue_of(choices.get('catalogue'))
     tolerances = choices.get('tolerances') or config_file('tolerances.yaml')
     read = checked_tolerances if isinstance(tolerances, Mapping) else files.read_tolerances
+    gravity, gravity_sd = local_gravity(*(choices.get(name) for name in ('gravity', 'latitude', 'height')))
     return CalibrationOptions(choices.get('accelerometer_model'), choices.get('gyroscope_model'), choices.get('reference_model'),
                               read(tolerances, catalogue), window_settings(choices.get('setting') or ()),
-                              nominal_of(choices.get('nominal')), choices.get('gravity'), catalogue, noise_of(choices.get('noise')),
-                              as_asked=bool(choices.get('model_as_asked')))
+                              nominal_of(choices.get('nominal')), gravity, catalogue, noise_of(choices.get('noise')),
+                              as_asked=bool(choices.get('model_as_asked')), gravity_sd=gravity_sd)
 
 
 def catalogue_of(chosen: Catalogue | str | PathLike | Mapping | None) -> Catalogue:

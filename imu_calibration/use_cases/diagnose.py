@@ -107,7 +107,7 @@ def diagnose(recording: str | PathLike | SampleBlock, table: Stand | None = None
     options = calibration_options(choices)
     topics = topics_of(choices)
     provenance = provenance_with('diagnose', [recording], choices, stand=table)
-    table = None if table is None else table_of(table, [recording], topics, gravity=choices.get('gravity'))
+    table = None if table is None else table_of(table, [recording], topics, gravity=options.gravity)
     source = source_of(recording, topics, None if table is None else table.joint_names)
     advance = counter('diagnosing', 100)
     if table is None:

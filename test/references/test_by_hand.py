@@ -9,12 +9,16 @@ from imu_calibration.by_hand.calibrate import calibrate_by_hand
 from imu_calibration.by_hand.equations import Poses, State, TurnData, build_system, moved
 from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence
 from imu_calibration.by_hand.model import unpack
-from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTurn
+from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTurn, hand_options
 from imu_calibration.by_hand.preintegration import integrate_turn
+from imu_calibration.calibration.live_settings import LiveByHandSettings
+from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.estimation.variance_components import estimate_group_variances, student_factor
+from imu_calibration.reference.earth import normal_gravity
 from imu_calibration.samples import ImuSamples, NominalScaling
 from imu_calibration.segmentation.static_detector import find_still
+from imu_calibration.use_cases.choices import calibration_options
 
 from worlds.hand_sessions import FACES, FULL, GRAVITY, NOMINAL, PARAM_NAMES, random_truth, simulate, turn_samples
 
@@ -204,6 +208,27 @@ def test_wrong_gravity_is_a_common_scale_and_its_sd_goes_there():
     np.testing.assert_allclose(unsure.sd_of('accelerometer.matrix.xx')**2 - right.sd_of('accelerometer.matrix.xx')**2,
                                (0.02 / GRAVITY * right.value('accelerometer.matrix.xx'))**2, rtol=1e-6)
     assert unsure.sd_of('accelerometer.bias.x') == right.sd_of('accelerometer.bias.x')
+
+
+def test_gravity_follows_from_latitude_and_height():
+    """Normal gravity of WGS 84 at 48.8 deg and 100 m (9.808959, pyins 1.0) with a relative sd of 1e-4, by hand as on a table."""
+    imu, ranges, _ = simulate(7)
+    options = hand_options(calibration_options({'latitude': 48.8, 'height': 100.0}))
+    assert options.gravity == pytest.approx(normal_gravity(48.8, 100.0), abs=1e-9) and options.gravity_sd == pytest.approx(1e-4 * options.gravity)
+    unsure, sure = (calibrate_by_hand(imu, HandOptions(options.gravity, sd), ranges) for sd in (options.gravity_sd, 0.0))
+    name = 'accelerometer.matrix.xx'
+    assert unsure.sd_of(name)**2 - sure.sd_of(name)**2 == pytest.approx((1e-4 * sure.value(name))**2, rel=1e-4)
+    live = LiveByHandSettings(latitude=48.8, height=100.0).at_place(CalibrationOptions())
+    assert (live.gravity, live.gravity_sd) == (options.gravity, options.gravity_sd)
+    assert LiveByHandSettings(gravity=9.81, latitude=48.8).at_place(CalibrationOptions()).gravity == 9.81
+    assert LiveByHandSettings().at_place(CalibrationOptions()).gravity is None
+
+
+@pytest.mark.parametrize('given, code, values', [({'latitude': 91.0}, 'place_impossible', (91,)), ({'height': 100.0}, 'latitude_missing', (100,)),
+                                                 ({'latitude': 48.0, 'gravity': 9.81}, 'gravity_twice', (48, 9.81))])
+def test_impossible_places_are_refused(given, code, values):
+    with refused(InputError, code, *values):
+        calibration_options(given)
 
 
 def test_axes_follow_the_gauge():
