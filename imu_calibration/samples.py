@@ -175,3 +175,16 @@ class NominalScaling:
 def runs_of(flags: ArrayLike) -> np.ndarray:
     """Return (start, stop) of each run of true flags, half open, shape (n_runs, 2)."""
     return np.flatnonzero(np.diff(np.concatenate([[False], np.asarray(flags, bool), [False]]))).reshape(-1, 2)
+
+
+def smallest_step(readings: np.ndarray, least: float = 1e-9) -> np.ndarray:
+    """Return the smallest step from one reading to the next in each column, (n, k), above the share `least` of the largest, shape (k,)."""
+    step = np.abs(np.diff(readings, axis=0))
+    real = step > least * np.maximum(np.abs(readings).max(axis=0, initial=0.0), 1e-12)
+    return np.min(np.where(real, step, np.inf), axis=0, initial=np.inf)
+
+
+def rounding_variance(readings: np.ndarray) -> np.ndarray:
+    """Return the variance of rounding, ``step^2 / 12`` of the smallest step, of each column, shape (k,); 0 where none changes."""
+    step = smallest_step(readings, 1e-12)
+    return np.where(np.isfinite(step), step, 0.0)**2 / 12

@@ -7,10 +7,13 @@ import numpy as np
 from imu_calibration.by_hand.equations import Poses
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.samples import ImuSamples
+from imu_calibration.samples import ImuSamples, rounding_variance
 
 CREEPS = 3.0
 """Mean square of the slopes of forces across gravity, over what noise gives them, from which on poses creep."""
+
+DITHER = 3.0
+"""Variance of readings over that of rounding below which rounding is not averaged: half a step; 1 % of a step remains above."""
 
 
 def average_poses(imu: ImuSamples, ranges: Sequence[tuple[int, int]], temperature_c: np.ndarray | None = None) -> Poses:
@@ -22,10 +25,11 @@ def average_poses(imu: ImuSamples, ranges: Sequence[tuple[int, int]], temperatur
     The noise need not be white: means of pieces of half a second or more say by how much sums of samples scatter beyond it.
     """
     parts = {'accelerometer': [imu.force_s[a:b] for a, b in ranges], 'gyroscope': [imu.rate_s[a:b] for a, b in ranges]}
-    noise = {sensor: _pooled_noise(part) for sensor, part in parts.items()}
+    rounding = {'accelerometer': rounding_variance(imu.force_s), 'gyroscope': rounding_variance(imu.rate_s)}
+    noise = {sensor: _pooled_noise(part, rounding[sensor]) for sensor, part in parts.items()}
     count, kinds = np.array([b - a for a, b in ranges]), ['static'] * len(ranges)
     means = [np.array([part.mean(0) for part in parts[sensor]]) for sensor in SENSORS]
-    sems = [np.sqrt(noise[sensor].mean_variance(kinds, count)) for sensor in SENSORS]
+    sems = [np.sqrt(_with_rounding(noise[sensor].mean_variance(kinds, count), parts[sensor], rounding[sensor])) for sensor in SENSORS]
     start, stop = np.array(ranges).T
     time = 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0])
     length = 1e-9 * (imu.stamp_ns[stop - 1] - imu.stamp_ns[start])
@@ -33,6 +37,12 @@ def average_poses(imu: ImuSamples, ranges: Sequence[tuple[int, int]], temperatur
     warm = None if temperature_c is None else np.array([temperature_c[a:b].mean() for a, b in ranges])
     return Poses(means[0], means[1] - creep, sems[0], sems[1], start=start, stop=stop, time=time, temperature_c=warm, noise=noise,
                  half_turn=0.5 * length[:, None] * creep, period=float(np.median(np.diff(imu.stamp_ns))) * 1e-9)
+
+
+def _with_rounding(variance, parts, rounding):
+    """Return the variance of the means, at least that of rounding where readings scatter by less than half a step and do not average it."""
+    within = np.array([part.var(axis=0) for part in parts])
+    return np.where(within < DITHER * rounding, np.maximum(variance, rounding), variance)
 
 
 def _creep(forces, length, noise):
@@ -60,10 +70,10 @@ def noise_statistics(poses: Poses) -> dict:
     return found | {'period': poses.period}
 
 
-def _pooled_noise(parts, pieces=8):
+def _pooled_noise(parts, rounding, pieces=8):
     """Return the NoiseModel of samples, from the median of the intervals and how much means of pieces scatter more than white noise."""
     floor = 1e-9 * max(1e-3, max(np.max(np.abs(p)) for p in parts))
-    within = np.sqrt(np.median([p.var(0, ddof=1) for p in parts], axis=0)) + floor
+    within = np.sqrt(np.maximum(np.median([p.var(0, ddof=1) for p in parts], axis=0), rounding)) + floor
     ratios = []
     for part in parts:
         length = len(part) // pieces

@@ -27,7 +27,9 @@ def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | 
     static = [row for row in rows if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))]
     if not static:
         return None
-    variances = np.array([row.sensors[sensor].noise_variance for row in static])
+    rounding = np.array([row.sensors[sensor].noise_variance for row in rows if row.kind != 'static']).reshape(-1, 3)
+    floor = np.min(np.where(rounding > 0, rounding, np.inf), axis=0, initial=np.inf)   # a code may be constant at rest
+    variances = np.maximum([row.sensors[sensor].noise_variance for row in static], np.where(np.isfinite(floor), floor, 0.0))
     inflations = np.array([row.sensors[sensor].inflation for row in static])
     counts = np.array([row.count for row in static], float)
     pooled, factors = np.empty(3), np.empty(3)
@@ -39,8 +41,7 @@ def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | 
         weight = (counts >= 32) * near
         factors[axis] = np.average(inflations[:, axis], weights=weight) if weight.sum() else 1.0
         factors[axis] = max(factors[axis], LEAST_SHAKEN if shaken else LEAST_INFLATION)
-    floor = LEAST_NOISE[sensor]**2
-    return np.maximum(pooled, floor), factors
+    return np.maximum(pooled, LEAST_NOISE[sensor]**2), factors
 
 
 def _usual(variances, inflations):

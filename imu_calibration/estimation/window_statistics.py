@@ -12,6 +12,7 @@ from imu_calibration.estimation.pieces import moving_pieces, pieces_at_rest
 from imu_calibration.estimation.triangular import triangular
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.table import Table
+from imu_calibration.samples import rounding_variance
 from imu_calibration.segmentation.window import Window
 
 SLOW_TIME = 0.25
@@ -36,7 +37,7 @@ class SensorStatistics:
     within: np.ndarray
     """Triangular factor of the centred rows, shape (k, n_columns + 3); no rows for a static window."""
     noise_variance: np.ndarray
-    """Variance of the output about its mean (static windows; else NaN), shape (3,)."""
+    """Variance of the output about its mean in static windows, at least that of rounding; in others that of rounding; shape (3,)."""
     inflation: np.ndarray
     """Variance of batch means over that of white noise of the same variance, shape (3,); NaN when not static."""
     slow: np.ndarray | None = None
@@ -133,7 +134,7 @@ def _reduced(window, designs, session, inputs):
 def _reduce_static(design, output):
     mean = np.concatenate([design.mean(axis=0), output.mean(axis=0)])
     variance, inflation = batch_statistics(output)
-    return SensorStatistics(mean, np.zeros((0, len(mean))), variance, inflation)
+    return SensorStatistics(mean, np.zeros((0, len(mean))), np.maximum(variance, rounding_variance(output)), inflation)
 
 
 def _reduce_moving(design, output, length):
@@ -141,7 +142,7 @@ def _reduce_moving(design, output, length):
     mean = rows.mean(axis=0)
     rows -= mean
     unknown, slow = np.full(3, np.nan), slow_part(rows, length)
-    return SensorStatistics(mean, triangular(rows), unknown, unknown, triangular(slow), len(slow))
+    return SensorStatistics(mean, triangular(rows), rounding_variance(output), unknown, triangular(slow), len(slow))
 
 
 def piece_length(window: Window) -> int:

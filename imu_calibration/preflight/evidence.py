@@ -12,6 +12,7 @@ from imu_calibration.preflight.frozen_parts import FrozenPart, StandingJoints, f
 from imu_calibration.preflight.full_scale import factor_between_rests
 from imu_calibration.preflight.rest import Rest, find_rest
 from imu_calibration.preflight.turning import Turning, relate_turns
+from imu_calibration.samples import smallest_step
 from imu_calibration.segmentation.block_cleaning import STREAMS, CleanedBlock
 from imu_calibration.segmentation.stream_cleaning import StreamStatistics
 
@@ -154,10 +155,7 @@ class EvidenceGatherer:
             downwards.push(-column)
 
     def _note_resolution(self, columns):
-        step = np.abs(np.diff(columns, axis=1))
-        # Steps of rounding are no steps of the converter.
-        real = step > 1e-9 * np.maximum(np.abs(columns).max(axis=1, keepdims=True), 1e-12)
-        self._resolution = np.minimum(self._resolution, np.min(np.where(real, step, np.inf), axis=1, initial=np.inf))
+        self._resolution = np.minimum(self._resolution, smallest_step(columns.T))
 
 
 class _Steps:

@@ -231,12 +231,14 @@ def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         step, range_ = evidence.resolution[part], evidence.rest.range[part]
         # Rounding shows as few different readings; noise of one sd spans about four in a chunk.
         coarse = (step > ROUNDING) & (4 * step > range_)
+        constant = coarse & (range_ == 0)
         if coarse.any():
             size = step[coarse].max()
             people = f'{size / DEG:.2g} deg/s' if unit == 'rad/s' else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
             yield CheckFinding('resolution', NOTE,
-                               f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}: '
-                               'means over short windows are rounded too')
+                               f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}'
+                               + (f' and constant at rest on {_axes(constant)}' if constant.any() else '')
+                               + ': means over short windows are rounded too; the noise is at least step/sqrt(12)')
 
 
 def temperature(evidence: RecordingEvidence) -> Iterator[CheckFinding]:

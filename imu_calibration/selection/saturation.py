@@ -13,6 +13,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.estimation.window_statistics import joined_motion
 from imu_calibration.reference.table import Table
+from imu_calibration.samples import rounding_variance
 from imu_calibration.segmentation.window import Window
 
 MARGIN = 4.0
@@ -67,10 +68,11 @@ def measured(window: Window, sensor: str) -> np.ndarray:
 
 
 def noise_at_rest(windows: Sequence[Window], sensor: str) -> np.ndarray:
-    """Return the standard deviation of single samples in static windows (of second differences without any), shape (3,)."""
+    """Return the sd of samples in static windows, at least that of rounding (without any: of second differences), shape (3,)."""
     rest = [w for w in windows if w.kind == 'static' and len(w.time) > 8]
     if rest:
-        return np.median([measured(w, sensor).std(axis=0) for w in rest], axis=0)
+        rounding = np.sqrt(rounding_variance(np.concatenate([measured(w, sensor) for w in windows])))
+        return np.maximum(np.median([measured(w, sensor).std(axis=0) for w in rest], axis=0), rounding)
     return np.median([np.diff(measured(w, sensor), 2, axis=0).std(axis=0) / np.sqrt(6) for w in windows if len(w.time) > 8], axis=0)
 
 

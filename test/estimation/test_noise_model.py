@@ -8,6 +8,8 @@ import pytest
 from imu_calibration.estimation.band_misfit import least_misfit, misfit_along
 from imu_calibration.estimation.noise_at_rest import white_noise
 from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise, dof_factor
+from imu_calibration.samples import rounding_variance
+from imu_calibration.selection.saturation import noise_at_rest
 from imu_calibration.simulation.sensor_noise import gauss_markov
 
 
@@ -28,6 +30,18 @@ def test_a_knocked_rest_does_not_enter_the_noise():
     white, inflation = white_noise([rest(1.0), rest(1.1), rest(0.9), rest(50.0, 40.0)], 'gyroscope')
     np.testing.assert_allclose(white, 1.0)
     np.testing.assert_allclose(inflation, 1.0)
+
+
+def test_a_code_that_is_constant_at_rest_has_the_noise_of_rounding():
+    """Steps of 0.08 show in motion only: the variance at rest is step^2 / 12, not zero, which made ratios to the noise at rest 3e5."""
+    moving = rest(rounding_variance(0.08 * np.round(np.linspace([0.0], [5.0], 400) / 0.08))[0])
+    moving.kind = 'dynamic'
+    white, _ = white_noise([rest(0.0), rest(0.0), moving], 'gyroscope')
+    np.testing.assert_allclose(white, 0.08**2 / 12, rtol=1e-9)
+    np.testing.assert_array_equal(rounding_variance(np.ones((5, 2))), 0.0)
+    still, turning = (SimpleNamespace(kind=kind, time=np.arange(len(rate)), rate_s=rate) for kind, rate in
+                      (('static', np.ones((20, 3))), ('dynamic', 0.08 * np.repeat(np.arange(30.0)[:, None], 3, axis=1))))
+    np.testing.assert_allclose(noise_at_rest([still, turning], 'gyroscope'), 0.08 / np.sqrt(12))
 
 
 def test_a_variance_from_few_data_is_taken_larger():

@@ -1,5 +1,7 @@
 """Calibration by hand: identities, Jacobians, honest uncertainty, what is held, and real recordings."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from refusal import refused
@@ -189,6 +191,19 @@ def test_misfit_of_inseparable_groups_counts_for_each():
     few = estimate_group_variances(design[:11], residual[:11], np.full(11, 1e-4), group=group[:11], start=np.ones(2) * 1e-4,
                                    fallback=np.ones(2) * 1e-4)
     assert few.dof.max() < 2 and np.all(few.upper > 1.0)
+
+
+@pytest.mark.parametrize('step', [0.04, 0.08])
+def test_coarse_readings_have_the_noise_of_rounding(step):
+    """Readings that are constant in every pose: their means are known to step / sqrt(12); before, to 1e-8 of the reading."""
+    imu, ranges, truth = simulate([16, 6], n_poses=14, force_sd=0.002)
+    found = calibrate_by_hand(replace(imu, force_s=step * np.round(imu.force_s / step)), HandOptions(GRAVITY), ranges)
+    np.testing.assert_allclose(found.poses.force_sem.max(), step / np.sqrt(12), rtol=0.01)
+    np.testing.assert_allclose(found.statistics['force_noise_sd'], step / np.sqrt(12), rtol=0.01)
+    error, covariance = differences(found, truth)
+    assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(covariance)))
+    fine = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
+    np.testing.assert_allclose(fine.statistics['force_noise_sd'], 0.002, rtol=0.1)   # steps far below the noise change nothing
 
 
 def test_counts_give_the_same_as_si():
