@@ -11,15 +11,19 @@ from difflib import get_close_matches
 KEYS = {
     'allow_xacro': 'permission to run a .xacro file',
     'anyway': 'consent to use an unproven calibration', 'calibration': 'the calibration document',
-    'columns': 'the columns of a text log', 'force': 'consent to overwrite another result', 'frame_id': 'the frame of the IMU',
-    'gravity': 'the local gravity',
-    'imu_topic': 'the topic of the IMU', 'jobs': 'the number of processes', 'joint_topic': 'the topic of the joints',
+    'columns': 'the columns of a text log', 'diagnose': 'the diagnosis of model errors', 'force': 'consent to overwrite another result',
+    'frame_id': 'the frame of the IMU', 'gravity': 'the local gravity', 'imu_topic': 'the topic of the IMU',
+    'inspect': 'the check of a recording', 'jobs': 'the number of processes', 'joint_topic': 'the topic of the joints',
     'noise': 'the figures of the noise', 'nominal': 'nominal conversion of volts or counts', 'scheduler': 'the address of a cluster',
     'setting': 'how windows are found', 'table': 'the description of the table', 'target_frame': 'the frame to move readings to',
     'temperature_topic': 'the topic of the temperature', 'imu_link': 'the link that carries the IMU', 'up': 'where up is',
     'urdf': 'the robot description',
 }
-"""Inputs that an error may request."""
+"""Inputs that an error may request, and programs that a remedy may need."""
+OFFERS = {'anyway': ', or give your consent', 'nominal': ', or give a nominal scaling'}
+"""Key -> a second remedy, which is offered only where the key has a name."""
+VERBS = {'diagnose': "run 'imu_calibration diagnose' to {}", 'inspect': "run 'imu_calibration inspect' to {}"}
+"""Key -> the program for a remedy, unless the hints name another one."""
 
 
 class ImuCalibrationError(Exception):
@@ -82,7 +86,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:
     """
-    Return a text with the missing input in the terms of the program that prints it.
+    Return a text whose remedy is available in the program that prints it.
 
     Parameters
     ----------
@@ -90,7 +94,10 @@ def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:
     key : str or None
         A key of `KEYS`.
     hints : dict
-        Key -> its local name, such as ``{'gravity': "parameter 'gravity'"}``; a key without a local name
+        Key -> its local name, such as ``{'gravity': "parameter 'gravity'"}``, or for a key of `VERBS` a phrase with ``{}`` for the text;
+        a key without a local name adds nothing.
 
     """
-    return printable(f'{text} ({hints[key]})' if key in hints else text)
+    if key in VERBS:
+        return printable(hints.get(key, VERBS[key]).format(text))
+    return printable(f'{text}{OFFERS.get(key, "")} ({hints[key]})' if key in hints else text)

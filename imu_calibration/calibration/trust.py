@@ -60,7 +60,7 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
         consent = refused_sensors(calibration, anyway=True, live=live).keys() != set(SENSORS)
         text = ('a calibration must help a sensor on held-out data to be applied, this one does not: '
                 f'{first} {refused[first]}; calibrate again')
-        raise DocumentError(f'{text}{", or give your consent" * consent}', key='anyway' if consent else None, code='no_sensor_helps')
+        raise DocumentError(text, key='anyway' if consent else None, code='no_sensor_helps')
     cautions = tuple(f'{sensor} {_text(calibration, sensor)}' for sensor in SENSORS
                      if sensor not in refused and words[sensor] is not HELPS)
     return Usable(with_nominal(calibration, list(refused)) if refused else calibration, refused, cautions)

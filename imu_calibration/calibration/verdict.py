@@ -124,9 +124,9 @@ def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
 
 def _decided(calibration, sensor, word):
     entry = calibration.proof.get(sensor) or {'one_attitude': True}
-    step = '' if word is HELPS else ('record more windows, or hold it still in more attitudes' if entry.get('one_attitude')
-                                     else "run 'imu_calibration diagnose' to find the cause")
-    return Reason(DECISION, f'{sensor} {word}: {_reason(calibration, sensor)}', step, sensors=(sensor,))
+    step, key = ('', None) if word is HELPS else ('record more windows, or hold it still in more attitudes', None) \
+        if entry.get('one_attitude') else ('find the cause', 'diagnose')
+    return Reason(DECISION, f'{sensor} {word}: {_reason(calibration, sensor)}', step, key=key, sensors=(sensor,))
 
 
 def _decision(calibration, sensor):
@@ -169,8 +169,8 @@ def _strange_causes(calibration):
     catalogue = {effect.name: effect.sensor for effect in calibration.model.catalogue.effects(calibration.model.joint_names).values()}
     return [Reason(WARNING, f'{name} {beyond_known(share, catalogue.get(name, ""))}; '
                    'it is not in the model, and the standard deviations allow for it',
-                   f"see 'imu_calibration diagnose'; if {name} is expected, "
-                   "name it in the model", sensors=_whose([catalogue.get(name, '')]))
+                   f'see the evidence; if {name} is expected, name it in the model',
+                   key='diagnose', sensors=_whose([catalogue.get(name, '')]))
             for name, share in found.items()]
 
 
@@ -178,7 +178,7 @@ def _misfits(calibration):
     """Return the residuals in motion that are far above the noise at rest."""
     return [Reason(WARNING, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}: '
                             f'the model is incomplete{", although the calibration helps in each regime" if helps else ""}',
-                   "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
+                   'find the cause', key='diagnose', sensors=(sensor,))
             for sensor in SENSORS for helps in [rested(calibration) and helps_everywhere(calibration.proof.get(sensor))]
             for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > MISFIT]
 

@@ -22,7 +22,7 @@ def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
 
 
 def _worse(calibration):
-    return [Reason(WARNING, f'{sensor}: {line}', "run 'imu_calibration diagnose' to find the cause", sensors=(sensor,))
+    return [Reason(WARNING, f'{sensor}: {line}', 'find the cause', key='diagnose', sensors=(sensor,))
             for sensor, entry in calibration.proof.items() for line in worse_regimes(entry)]
 
 
@@ -44,10 +44,10 @@ def _adopted(calibration):
     added, denied = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
     notes = [Reason(NOTE, 'added to the model, because the recording demands it: '
                     f'{", ".join(_with_size(calibration, name) for name in added)}',
-                    "see 'imu_calibration diagnose' for the evidence; the requested model omits it")] if added else []
+                    'see the evidence; the requested model omits it', key='diagnose')] if added else []
     notes += [Reason(NOTE, f'not added to the model, because parts of the recording disagree, no coefficient is significant or the size is '
                     f'implausible: {", ".join(denied)}; the standard deviations allow for it',
-                     "see 'imu_calibration diagnose'")] if denied else []
+                     'see the evidence', key='diagnose')] if denied else []
     lacking = calibration.statistics.get('lacking') or []
     notes += [Reason(NOTE, f'the motion demands {", ".join(lacking)}, which cannot join the model, since not all of it is kept: '
                      'the standard deviations allow for it', 'calibrate the recording offline')] if lacking else []
@@ -76,7 +76,7 @@ def _with_size(calibration, name):
 
 def _loose(calibration):
     return [Reason(NOTE, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}',
-                   "see 'imu_calibration diagnose' when that matters to you")
+                   'find the cause where it matters', key='diagnose')
             for sensor in SENSORS for kind, ratio in misfit_ratios(calibration, sensor).items() if LOOSE < ratio <= MISFIT]
 
 
@@ -117,4 +117,4 @@ def _lost(calibration):
     total, used = sum(dropped.values()), sum((calibration.statistics.get('samples_used') or {}).values())
     text = 'dropped: ' + ', '.join(f'{count} {reason}' for reason, count in dropped.items())
     many = total > LOST_SHARE * max(used, 1)
-    return [Reason(NOTE, text, "check the recording with 'imu_calibration inspect'" if many else '')]
+    return [Reason(NOTE, text, 'find the cause' if many else '', key='inspect')]

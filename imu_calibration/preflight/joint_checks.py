@@ -110,8 +110,8 @@ def _rate_units(moments):
         return
     if 40 < ratio < 80:
         yield CheckFinding('rate_unit', REFUSE,
-                           f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: probably deg/s; '
-                      'convert them in the driver or give a nominal scaling with gyroscope_scale 57.29578', key='nominal')
+                           f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: probably deg/s, '
+                           'gyroscope_scale 57.29578; convert them in the driver', key='nominal')
     elif 1 / 80 < ratio < 1 / 40:
         yield CheckFinding('rate_unit', REFUSE,
                            f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: probably '
@@ -119,7 +119,7 @@ def _rate_units(moments):
     elif not 0.5 < ratio < 2.0 and np.linalg.norm(cross)**2 > RELATED * np.trace(measured) * np.trace(reference) / 3:
         yield CheckFinding('rate_unit', REFUSE,
                            f'angular rates must be in rad/s, they are {ratio:.4g} times the rates of the joints: counts or volts?; '
-                      'give a nominal scaling with gyroscope_offset and gyroscope_scale', key='nominal')
+                      'convert them in the driver', key='nominal')
 
 
 def _axes(sensor, moments, table, windows):

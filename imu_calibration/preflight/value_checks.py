@@ -53,14 +53,13 @@ def force_error(length: float, where: str = 'at rest') -> InputError | None:
     """Return the error for a median length of the specific force that is not gravity in m/s^2, None for one that can be."""
     said = f'specific force must be in m/s^2, its length {where} is {length:.4g}: '
     if unit := unit_of_rest(length):
-        return InputError(f'{said}it is probably {unit}; convert it in the driver or give a nominal scaling with accelerometer_scale '
-                          f'{OTHER_UNITS[unit]:.6g}', key='nominal', code='force_unit')
+        return InputError(f'{said}it is probably {unit}, accelerometer_scale {OTHER_UNITS[unit]:.6g}; convert it in the driver',
+                          key='nominal', code='force_unit')
     if length < LINEAR:
         return InputError(f'{said}it is probably acceleration without gravity, as phones compute it; record the raw accelerometer',
                           key='imu_topic', code='without_gravity')
     if not 3.0 < length < 30.0:
-        return InputError(f'{said}counts or volts?; give a nominal scaling with accelerometer_offset and accelerometer_scale',
-                          key='nominal', code='force_unit')
+        return InputError(f'{said}counts or volts?; convert it in the driver', key='nominal', code='force_unit')
     return None
 
 
@@ -73,26 +72,25 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Angular rate is in rad/s: gravity turns by what the rates add up to."""
     turning = evidence.turning
     largest = max((end.level for pair in evidence.ends[3:] for end in pair), default=0.0)
-    scaling = 'give a nominal scaling with gyroscope_offset and gyroscope_scale'
+    convert = 'convert them in the driver'
     if turning is not None:
         ratio = 1.0 / turning.factor
         came = f'angular rates must be in rad/s, they are {significant(ratio)} times the rotation of the measured gravity: '
         if 0.6 < ratio * DEG < 1.6:
             yield _unit('rate_unit',
-                        f'{came}probably deg/s; convert them in the driver or give a nominal scaling with gyroscope_scale 57.29578')
+                        f'{came}probably deg/s, gyroscope_scale 57.29578; {convert}')
         elif 0.6 < ratio / DEG < 1.6:
-            yield _unit('rate_unit', f'{came}probably converted from deg/s twice; convert once, or give a nominal scaling with '
-                                     'gyroscope_scale 0.01745329')
+            yield _unit('rate_unit', f'{came}probably converted from deg/s twice, gyroscope_scale 0.01745329; convert them once')
         elif _full_scale(evidence) is not None:
             return
         elif not 0.5 < ratio < 2.0:
-            yield _unit('rate_unit', f'{came}counts or volts?; {scaling}')
+            yield _unit('rate_unit', f'{came}counts or volts?; {convert}')
         else:
             yield CheckFinding('rate_unit', GOOD, f'angular rate in rad/s: gravity rotates according to the rates{_about(turning.axes)}')
     elif largest > FASTEST:
         unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
         yield _unit('rate_unit', f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
-                                 f'convert them in the driver or {scaling}')
+                                 f'{convert}')
 
 
 def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:

@@ -3,6 +3,8 @@
 import ast
 import pickle
 import re
+import subprocess
+import sys
 from itertools import chain
 from pathlib import Path
 
@@ -14,7 +16,9 @@ from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.main import main
 from imu_calibration.cli.parser import VERBS, make_parser
 from imu_calibration.errors import KEYS, InputError, with_hint
+from imu_calibration.errors import VERBS as PROGRAMS
 from imu_calibration.nodes.hints import HINTS
+from imu_calibration.preflight.joint_checks import check_force
 from imu_calibration.samples import ImuSamples
 from msg_adapters.write import write_session
 
@@ -36,10 +40,42 @@ def test_no_text_of_the_core_names_an_option_of_the_command_line():
     assert found == []
 
 
+def keys_in(trees):
+    """Return the keys of errors in modules."""
+    return {part.value for tree in trees for node in ast.walk(tree) if isinstance(node, ast.keyword) and node.arg == 'key'
+            for part in ast.walk(node.value) if isinstance(part, ast.Constant) and part.value in KEYS}
+
+
+def test_no_text_of_the_core_tells_to_run_a_verb():
+    """The user of a node has no recording; `errors.VERBS` are replaced there."""
+    found = {(path.stem, verb) for path, tree in core() for node in ast.walk(tree) if path.stem not in ('errors', 'page')
+             if isinstance(node, ast.Constant) and isinstance(node.value, str)
+             for verb in re.findall(r"(?<!written by )'imu_calibration (\w+)'", node.value)}
+    # To apply a calibration to a recording, beside compensator_node; in a document that `import` writes.
+    assert found == {('verdict', 'compensate'), ('imported', 'check')}
+
+
+UNREACHABLE = {
+    'calibration_node': {'nominal': 'readings are converted in the driver, which the error says', 'anyway': 'no calibration is applied'},
+    'planner_node': {'anyway': 'no calibration is applied', 'nominal': 'no readings are compared', 'gravity': 'no calibration is estimated',
+                     'calibration': 'with a plan for separation alone', 'diagnose': 'no calibration is estimated', 'inspect': 'no calibration is estimated'},
+    'compensator_node': {'allow_xacro': 'no robot description is read'},
+    'bag_player_node': {'allow_xacro': 'no robot description is read'},
+}
+"""Node -> {key of errors in the modules that it imports: reason why the node needs no name for it}."""
+
+
+@pytest.mark.live
+@pytest.mark.parametrize('node', ['bag_player_node', 'calibration_node', 'compensator_node', 'planner_node', 'simulator_node'])
+def test_every_key_that_can_reach_a_node_has_a_name_there(node):
+    pytest.importorskip('rclpy')
+    program = f'import sys, imu_calibration.nodes.{node}; print(*[m.__file__ for m in sys.modules.values() if getattr(m, "__file__", None)])'
+    files = set(subprocess.run([sys.executable, '-c', program], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split())
+    assert keys_in(tree for path, tree in core() if str(path) in files) - set(HINTS.get(node, {})) == set(UNREACHABLE.get(node, {}))
+
+
 def test_every_key_is_known_and_every_known_one_is_used():
-    used = {value.value for _, tree in core() for node in ast.walk(tree) if isinstance(node, ast.keyword) and node.arg == 'key'
-            for value in ([node.value.body, node.value.orelse] if isinstance(node.value, ast.IfExp) else [node.value])
-            if isinstance(value, ast.Constant) and value.value is not None}
+    used = keys_in(tree for _, tree in core())
     from msg_adapters.bag import KEYS as topics
     assert used | set(topics.values()) == set(KEYS)
 
@@ -59,7 +95,7 @@ def test_a_verb_names_only_options_that_it_has(verb):
 
 
 def test_every_key_is_an_option_of_some_verb():
-    assert {key for verb in VERBS for key in hints_and_options(verb)[0]} == set(KEYS)
+    assert {key for verb in VERBS for key in hints_and_options(verb)[0]} == set(KEYS) - set(PROGRAMS)
 
 
 @pytest.mark.parametrize('node', HINTS)
@@ -67,9 +103,26 @@ def test_a_node_names_only_parameters_and_topics_that_it_has(node):
     parameters = re.findall(r'^    (?:# )?(\w+):', (ROOT / f'config/{node}.yaml').read_text(), flags=re.M)
     source = (ROOT / f'imu_calibration/nodes/{node}.py').read_text()
     assert set(HINTS[node]) <= set(KEYS)
-    for hint in HINTS[node].values():
+    assert set(HINTS[node]) >= ({'anyway'} if 'anyway' in parameters else set())
+    for key, hint in HINTS[node].items():
+        if key in PROGRAMS:
+            service, verb = re.findall(r'~/(\w+)', hint), re.findall(r"'imu_calibration (\w+)", hint)
+            assert hint.count('{}') == 1 and (service or verb) and set(verb) <= set(VERBS) and all(f"'{name}'" in source for name in service)
+            continue
         kind, name = hint.split()
         assert name.strip("'") in parameters if kind == 'parameter' else f"'{name}'" in source
+
+
+def test_a_second_remedy_is_offered_only_where_it_exists():
+    with pytest.raises(InputError) as refusal:
+        check_force(1.0)
+    error = refusal.value
+    assert 'nominal scaling (--nominal)' in error.told({'nominal': '--nominal'})
+    for node in HINTS:
+        assert 'nominal' not in error.told(HINTS[node]) and error.told(HINTS[node]).endswith('convert it in the driver')
+    assert with_hint('find the cause', 'diagnose', HINTS['calibration_node']) == 'call ~/diagnose to find the cause'
+    assert with_hint('find the cause', 'diagnose', {}) == "run 'imu_calibration diagnose' to find the cause"
+    assert 'consent' in with_hint('calibrate again', 'anyway', HINTS['compensator_node']) > with_hint('calibrate again', 'anyway', {})
 
 
 def test_the_hint_follows_the_text_where_the_thing_has_a_name():

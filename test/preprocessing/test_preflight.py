@@ -221,8 +221,8 @@ def in_kelvin(imu, joints, temperature):
 FAULTS = (
     (in_g, 'force_unit', REFUSE, ('m/s^2', 'accelerometer_scale 0.101972')),
     (in_mg, 'force_unit', REFUSE, ('mg', 'accelerometer_scale 101.972')),
-    (in_counts, 'force_unit', REFUSE, ('counts', 'nominal scaling')),
-    (in_counts, 'rate_unit', REFUSE, ('counts', 'nominal scaling')),
+    (in_counts, 'force_unit', REFUSE, ('counts', 'in the driver')),
+    (in_counts, 'rate_unit', REFUSE, ('counts', 'in the driver')),
     (without_gravity, 'force_unit', REFUSE, ('m/s^2', 'gravity')),
     (in_degrees, 'rate_unit', REFUSE, ('rad/s', 'deg/s', 'gyroscope_scale 57.29578')),
     (twice_converted, 'rate_unit', REFUSE, ('twice',)),
@@ -517,7 +517,7 @@ def test_inspect_returns_the_worst_code_of_all_imus(capsys, tmp_path, session, t
             topic = bag.add_topic(f'/imu_{k}', standard_definition(IMU_TYPE))
             bag.write(np.full(len(imu), topic), imu.stamp_ns, rows(encode_imu(imu)))
     assert main(['inspect', str(tmp_path / 'bag')]) == 3
-    assert 'accelerometer_scale 0.101972' in capsys.readouterr().out
+    assert 'it looks like g,' in capsys.readouterr().out
     assert main(['inspect', str(tmp_path / 'bag'), '--imu-topic', f'/imu_{1 - bad}']) == 0
 
 
