@@ -4,7 +4,8 @@ _ARM = {'allow_xacro': "parameter 'allow_xacro'", 'urdf': "parameter 'urdf_file'
 HINTS = {
     'calibration_node': {'gravity': "parameter 'gravity'", 'table': "parameter 'table_file'", **_ARM, 'imu_topic': 'remap imu/data_raw',
                          'joint_topic': 'remap joint_states', 'temperature_topic': 'remap imu/temperature',
-                         'diagnose': 'call ~/diagnose to {}', 'inspect': "record a bag and run 'imu_calibration inspect BAG' to {}"},
+                         'inspect': "record a bag and run 'imu_calibration inspect BAG' to {}",
+                         'diagnose': "call ~/diagnose, by hand record a bag and run 'imu_calibration diagnose BAG', to {}"},
     'compensator_node': {'anyway': "parameter 'anyway'", 'calibration': "parameter 'calibration_file'", 'imu_topic': 'remap imu/data_raw',
                          'target_frame': "parameter 'target_frame'", 'temperature_topic': 'remap imu/temperature'},
     'planner_node': {**_ARM, 'table': "parameter 'table_file'", 'joint_topic': 'remap joint_states'},

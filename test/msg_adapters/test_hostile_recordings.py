@@ -11,8 +11,10 @@ import pytest
 import yaml
 from test_adapters_mcap import chunk, message, record, text, write_file
 
+from imu_calibration.documents import parsed
+from imu_calibration.errors import InputError
 from msg_adapters.bag import list_topics
-from msg_adapters.compressed import LARGEST_CHUNK, zstd
+from msg_adapters.compressed import LARGEST_CHUNK, decompress_message, zstd
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.definitions import deserializer, is_standard
 from msg_adapters.encode import encode_imu, encode_joints
@@ -98,6 +100,9 @@ def test_messages_that_expand_far_are_lost_and_counted(bag):
     connection.commit()
     connection.close()
     survived('inspect', bag)
+    with pytest.raises(ValueError, match='limit'):
+        decompress_message(zstd().compress(bytes(5 << 20)))
+    assert decompress_message(zstd().compress(bytes(3 << 20))) == bytes(3 << 20)
 
 
 # Storage
@@ -170,7 +175,7 @@ def test_overlapping_chunks_and_messages_between_chunks_take_linear_time(tmp_pat
 
 def doubling(n_levels, last):
     """A definition with 2^n fields."""
-    levels = [f'MSG: a/T{k}\nT{k + 1} a\nT{k + 1} b\n' for k in range(1, n_levels)] + [f'MSG: a/T{n_levels}\n{last}\n']
+    levels = [f'MSG: sensor_msgs/T{k}\nT{k + 1} a\nT{k + 1} b\n' for k in range(1, n_levels)] + [f'MSG: sensor_msgs/T{n_levels}\n{last}\n']
     return 'T1 a\nT1 b\n' + ''.join(SEPARATOR + level for level in levels)
 
 
@@ -178,28 +183,31 @@ def doubling(n_levels, last):
 def test_a_definition_with_far_too_many_fields_is_neither_standard_nor_used(last):
     definition = doubling(61, last)
     assert limited(is_standard, IMU_TYPE, 'ros2msg', definition).code is False
-    ended = limited(refuses_definition, definition)
-    assert ended.code is True, ended
+    ended = limited(refusal_of, definition)
+    assert ('more than 10000 elements' in ended.code) == (last == 'float64 x') and ended.code, ended
 
 
-@pytest.mark.parametrize('definition', ['string[2000000000] x', 'float64[2000000000] x', 'Header[99999] x\n' + SEPARATOR + 'MSG: std_msgs/Header\nuint32 seq\n',
-                                        'E[] x\n' + SEPARATOR + 'MSG: a/E\nint32 X=3\n', 'E[4] x\n' + SEPARATOR + 'MSG: a/E\nint32 X=3\n',
-                                        'E x\n' + SEPARATOR + 'MSG: a/E\nE x\n', 'int32 x\n' * 200_000])
-def test_definitions_of_endless_messages_are_refused(definition):
-    assert limited(refuses_definition, definition).code is True
+@pytest.mark.parametrize('definition, reason', [
+    ('string[2000000000] x', 'more than 10000 elements'), ('float64[2000000000] x', 'more than 10000 elements'),
+    ('Header[99999] x\n' + SEPARATOR + 'MSG: std_msgs/Header\nuint32 seq\n', 'more than 10000 elements'),
+    ('E[] x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nint32 X=3\n', 'elements without fields'),
+    ('E[4] x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nint32 X=3\n', 'elements without fields'),
+    ('E x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nE x\n', 'contains itself'), ('int32 x\n' * 200_000, 'at most 100000')])
+def test_definitions_of_endless_messages_are_refused(definition, reason):
+    assert reason in limited(refusal_of, definition).code
 
 
-def refuses_definition(definition):
-    """Return whether messages of a definition are refused; one of 400 bytes is read otherwise."""
+def refusal_of(definition):
+    """Return the reason why messages of a definition are refused, 'cannot be read' where one of 400 bytes is, else ''."""
     try:
         read = deserializer(IMU_TYPE, {IMU_TYPE: ('ros2msg', definition)})
-    except Exception:
-        return True
+    except ValueError as error:
+        return str(error)
     try:
         read(b'\0\1\0\0' + b'\xff' * 400)
     except Exception:
-        pass
-    return False
+        return 'cannot be read'
+    return ''
 
 
 # Metadata
@@ -211,12 +219,17 @@ def test_metadata_that_cost_more_than_they_say_are_left_out(bag, value):
                                        + f'hostile: {value}\n')
     assert survived('inspect', bag).code != 1
     assert spelled_out(value) == []
+    if value != '.inf':   # a number like others
+        with pytest.raises(InputError):
+            parsed(value, 'metadata', aliases=True)
 
 
 def test_nested_aliases_in_metadata_are_not_expanded(bag):
     lines = ['custom_data: &a0 [x, x]'] + [f'  c{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]' for k in range(1, 20)]
     (bag / 'metadata.yaml').write_text((bag / 'metadata.yaml').read_text().replace('custom_data: null', '\n'.join(lines)))
     assert survived('inspect', bag).code != 1
+    with pytest.raises(InputError):
+        parsed('\n'.join(line.strip() for line in lines), 'metadata', aliases=True)
 
 
 def test_members_that_never_end_or_come_again_are_left_out(bag, tmp_path):
