@@ -55,9 +55,11 @@ def test_no_text_of_the_core_tells_to_run_a_verb():
     assert found == {('verdict', 'compensate'), ('imported', 'check')}
 
 
+NAMED = {'setting': 'the text has the names of parameters of the node', 'imu_topic': 'no readings are compared'}
 UNREACHABLE = {
-    'calibration_node': {'nominal': 'readings are converted in the driver, which the error says', 'anyway': 'no calibration is applied'},
-    'planner_node': {'anyway': 'no calibration is applied', 'nominal': 'no readings are compared', 'gravity': 'no calibration is estimated',
+    'calibration_node': {'nominal': 'readings are converted in the driver, which the error says', 'anyway': 'no calibration is applied',
+                         'columns': 'no text log is read', 'force': 'results of verbs', 'up': 'of transforms in a bag', 'setting': NAMED['setting']},
+    'planner_node': {'anyway': 'no calibration is applied', **NAMED, 'nominal': 'no readings are compared', 'gravity': 'no calibration is estimated',
                      'calibration': 'with a plan for separation alone', 'diagnose': 'no calibration is estimated', 'inspect': 'no calibration is estimated'},
     'compensator_node': {'allow_xacro': 'no robot description is read'},
     'bag_player_node': {'allow_xacro': 'no robot description is read'},
