@@ -62,8 +62,8 @@ def add_model_arguments(parser: OneLineParser) -> _ArgumentGroup:
     """Add the options that choose the parameters to estimate; return their group."""
     group = parser.expert
     expert = group.add_argument
-    expert('--accelerometer-model', metavar='MODEL', help='named model or effects joined by +; default bias+matrix, with '
-           'accel_size_effect if the motion is sufficient')
+    expert('--accelerometer-model', metavar='MODEL', help='effects joined by +; default bias+matrix, and '
+           'accel_size_effect if observable')
     expert('--gyroscope-model', metavar='MODEL', help='likewise; default bias+matrix')
     expert('--reference-model', metavar='MODEL', help="effects of table and clock, or 'none'; default table_tilt")
     add_effects_argument(group)
