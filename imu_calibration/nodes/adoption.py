@@ -1,4 +1,4 @@
-"""From a calibration document to what a compensator corrects with: read, asked what speaks against it, prepared."""
+"""Read, validate and prepare a calibration document for compensation."""
 
 from dataclasses import dataclass, replace
 
@@ -19,7 +19,7 @@ from imu_calibration.nodes.static_frames import TOPIC, StaticFrames
 
 
 class Awaited(ImuCalibrationError):
-    """Nothing is wrong, but something else must come first; the text says what."""
+    """A precondition is not met yet; the text names it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,15 +27,15 @@ class Adopted:
     """A calibration that is in force."""
 
     calibration: Calibration
-    """What its document says."""
+    """Content of the document."""
     used: trust.Usable
-    """What of it is used."""
+    """The part of the calibration that is used."""
     compensation: LiveCompensation
-    """What corrects with it."""
+    """Compensation by this calibration."""
     version: str
     """Changes whenever the document does."""
     source: str
-    """Where it came from, for people."""
+    """Source of the document, readable."""
 
     @property
     def caveats(self) -> list[str]:
@@ -43,11 +43,11 @@ class Adopted:
         return [*self.used.lines, *trust.caveats(self.calibration)]
 
     def line(self) -> str:
-        """Return in one line what is in force."""
+        """Return one line that describes the calibration in force."""
         return f'calibration {self.version} from {self.source} ({trust.standing(self.calibration)}) adopted'
 
     def says_more_than(self, other: 'Adopted | None') -> bool:
-        """Return whether a person should hear of this after `other`: it came from elsewhere, or says something else."""
+        """Return whether the change from `other` must be reported: its source, decisions or values differ."""
         if other is None or self.calibration.decisions != other.calibration.decisions:
             return True
         if self.source != other.source or self.used.refused.keys() != other.used.refused.keys():
@@ -62,9 +62,9 @@ def adopt(text: str, source: str, settings: CompensatorSettings, *, frames: Stat
     Raises
     ------
     Awaited
-        While the transform into the target frame has not come.
+        While the transform into the target frame has not been received.
     ImuCalibrationError
-        When it is none, something speaks against it, or it is for another sensor; whatever else goes wrong is told in the same way.
+        When the document is invalid, not usable, or for another sensor; any other exception is converted to this type.
 
     """
     try:
@@ -74,7 +74,7 @@ def adopt(text: str, source: str, settings: CompensatorSettings, *, frames: Stat
         return Adopted(calibration, used, _prepared(used.calibration, settings, frames, before), version_of(text), source)
     except ImuCalibrationError:
         raise
-    except Exception as error:   # whatever a document does, it must not end the node
+    except Exception as error:   # no document may end the node
         what = shortened(f'{type(error).__name__}: {error}', 200)
         raise DocumentError(f'a calibration must be usable, this one is not: {what}', code='not_usable') from error
 
@@ -85,7 +85,7 @@ def again(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames)
 
 
 def has_moved(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> bool:
-    """Return whether the static transforms now say another pose than the one in force."""
+    """Return whether the pose from the static transforms differs from the one in force."""
     found = _transfer(adopted.calibration, settings, frames)
     return found is not None and not found.is_close(adopted.compensation.transfer)
 
@@ -119,7 +119,7 @@ def _prepared(calibration: Calibration, settings: CompensatorSettings, frames: S
 
 
 def _watch(calibration: Calibration, transfer: Transfer | None, settings: CompensatorSettings, before: Adopted | None) -> StopWatch:
-    """Return who looks at the stops: the one that does already, where nothing changes for it."""
+    """Return the StopWatch: the present one where its inputs are unchanged."""
     options = HealthOptions(settings.gravity, settings.update_gyro_bias, settings.gyro_bias_time)
     watch = None if before is None or before.used.calibration is not calibration else before.compensation.watch
     if before is not None and watch is not None and watch.health.options == options:

@@ -24,7 +24,7 @@ PAUSE = 0.01
 
 @dataclass(frozen=True)
 class PlayerSettings:
-    """What to play, and how fast."""
+    """Bag, topics and speed of playback."""
 
     bag: str = setting('', '', 'rosbag2 folder, .db3 or .mcap file; it must be given', symptom='the node refuses to start with a reason',
                        session=True, path=True)
@@ -60,7 +60,7 @@ class BagPlayerNode(Node):
                                f'{", ".join(self._topics)}')
 
     def close(self) -> str:
-        """Stop publishing and close the files; return what became of it."""
+        """Stop publishing and close the files; return the outcome."""
         self._playback.end()
         self._bag.close()
         return '' if self._is_over else f'stopped after {self._playback.n_published} messages'

@@ -1,4 +1,4 @@
-"""What calibration_node says on the terminal while a session goes on: one line at every change, with what can be done next."""
+"""Terminal lines of calibration_node during a session: one at every change, with the next useful action."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -11,22 +11,22 @@ from imu_calibration.nodes.inputs import MatchedInput
 from imu_calibration.segmentation.stamping import COUNTED, REGULAR
 
 PATIENCE = 5.0
-"""Seconds between two pieces of advice; what helps most may change with every solution."""
+"""Seconds between two pieces of advice; the most useful motion may change with every solution."""
 KINDS = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
 
 
 class CalibrationGuide:
     """
-    Finds in the state of the worker what a person should hear.
+    Derives the lines to report from the state of the worker.
 
     Parameters
     ----------
     inputs : mapping
         Stream ('imu', 'joints', 'temperature') -> MatchedInput.
     save_command : str
-        What saves the calibration, for people.
+        Command that saves the calibration, readable.
     noun : str
-        What is gathered: 'window' or 'pose'.
+        Unit of the collected data: 'window' or 'pose'.
     clock : callable
         Seconds of a steady clock.
 
@@ -39,7 +39,7 @@ class CalibrationGuide:
         self._gathered, self._verdict, self._advice, self._advised, self._diagnosed = 0, '', '', float('-inf'), ''
 
     def lines(self, state: WorkerState) -> Iterator[tuple[str, str]]:
-        """Yield (INFO or WARNING, line) for what has changed since the last call."""
+        """Yield (INFO or WARNING, line) for each change since the last call."""
         yield from self._streams(state)
         if state.gathered and not self._gathered:
             yield INFO, f'first {self._noun} gathered'
@@ -86,7 +86,7 @@ class CalibrationGuide:
 
 
 def advice_of(state: WorkerState) -> str:
-    """Return the motion or the thing that helps most now, '' when nothing is known."""
+    """Return the most useful next motion or action, '' when unknown."""
     if state.session is not None:
         return state.session.values.get('next', '')
     steps = [line.removeprefix('next: ') for line in state.lines if line.startswith('next: ')]

@@ -58,12 +58,12 @@ MOST_WAITING = 200_000
 DOCUMENTED = ('accelerometer_model', 'gyroscope_model', 'reference_model', 'model_as_asked', 'serial', 'operator')
 """Parameters that the document names with their values."""
 PATIENCE = 3.0
-"""Seconds after the start from which a silent topic is worth a word."""
+"""Seconds after the start from which a silent topic is reported."""
 
 
 @dataclass(frozen=True)
 class CalibrationNodeSettings:
-    """What the node reads, asks for and writes."""
+    """Inputs, reference and outputs of the node."""
 
     table_file: str = setting('', '', 'table description, path; empty or none: no table, calibrate by hand from poses held still and the '
                               'turns between them', symptom='joint states are not listened to', session=True, path=True,
@@ -109,7 +109,7 @@ class CalibrationNodeSettings:
 
 
 class CalibrationNode(Node):
-    """Listens, and tells what the worker finds."""
+    """Passes messages to the worker and reports its results."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('calibration_node', **options)
@@ -153,7 +153,7 @@ class CalibrationNode(Node):
         self.get_logger().info(f'calibrates {self._reference.text}; ~/save writes {self.worker.place.calibration}')
 
     def close(self) -> str:
-        """End the worker after what it is doing; return what became of the motion that is in no file."""
+        """End the worker after its present step; return the outcome for unsaved motion."""
         self._view.close()
         return self.worker.end()
 
@@ -199,7 +199,7 @@ class CalibrationNode(Node):
         self._diagnostics.publish_now()
         return response
 
-    # Changed parameters: the period of saving at once, all others by the worker between two of its steps.
+    # Changed parameters: the period of saving is applied at once, the remaining ones by the worker between two steps.
 
     def _change_files(self, group: CalibrationNodeSettings) -> None:
         self.worker.autosave_period, self.settings = group.autosave_period, group
@@ -231,11 +231,11 @@ class CalibrationNode(Node):
         try:
             publisher.publish(message)
         except Exception:
-            if self.context.ok():   # else the node is being shut down while the worker finishes
+            if self.context.ok():   # false while the node shuts down and the worker finishes
                 raise
 
     def _statuses(self) -> list:
-        """Return the diagnostics, and say on the terminal what has changed."""
+        """Return the diagnostics, and print changes on the terminal."""
         state = self.worker.state
         about_topics = [line for each in self._inputs.values() for line in each.faults()]
         streams = state.streams

@@ -1,4 +1,4 @@
-"""What the worker of calibration_node knows, for diagnostics and for the terminal."""
+"""State of the worker of calibration_node, for diagnostics and for the terminal."""
 
 from dataclasses import dataclass, field
 
@@ -9,7 +9,7 @@ from imu_calibration.preflight.stream_watch import StreamState
 
 @dataclass(frozen=True)
 class WorkerState:
-    """What diagnostics tell; replaced as a whole, so that another thread may read it."""
+    """State shown in diagnostics; replaced as one object, so that another thread may read it."""
 
     groups: list = field(default_factory=list)
     """GroupState of every effect."""
@@ -24,15 +24,15 @@ class WorkerState:
     trouble: str = ''
     """Why there is no new solution."""
     faults: tuple = ()
-    """What goes wrong at present and should not, a line each."""
+    """Present faults, a line each."""
     gathered: int = 0
     """Windows, or poses by hand."""
     values: dict = field(default_factory=dict)
     """Figures by name."""
     session: SessionStatus | None = None
-    """How far the session has come beyond what the groups tell: the poses of a calibration by hand."""
+    """Progress in addition to the parameter groups: the poses of a calibration by hand."""
     diagnosis: DiagnosisState | None = None
-    """What the model gets wrong; None without a table."""
+    """Detected model errors; None without a table."""
     place: str = ''
     """Where the calibration is saved."""
     judged: str = ''

@@ -1,4 +1,4 @@
-"""What calibration_node shows to Foxglove: how far the calibration has come."""
+"""Foxglove view of calibration_node: the progress of the calibration."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -13,13 +13,13 @@ from imu_calibration.use_cases.view_messages import PARAMETERS, RESIDUAL, SPECTR
 
 
 class CalibrationView(LiveView):
-    """Shows parameters with their bands, errors of windows before and after, the spectrum of what is left, the sphere."""
+    """Shows parameters with their bands, window errors before and after, the spectrum of the residuals, the sphere."""
 
     def __init__(self, node: Any, settings: FoxgloveSettings):
         super().__init__(node, (PARAMETERS, RESIDUAL, SPECTRUM, SPHERE), settings)
 
     def take_solution(self, result: CalibrationResult, windows: Sequence[Window]) -> None:
-        """Show a solution, and what it leaves within some windows."""
+        """Show a solution and its residuals within some windows."""
         self.show(PARAMETERS, partial(parameters, result.calibration, result.tolerances))
         self.show(RESIDUAL, partial(residual, result))
         self.show(SPECTRUM, partial(spectrum, result, windows))

@@ -1,4 +1,4 @@
-"""What compensator_node says about itself, on /diagnostics and on the terminal."""
+"""Status of compensator_node, on /diagnostics and on the terminal."""
 
 from math import sqrt
 from time import monotonic
@@ -17,13 +17,13 @@ from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublis
 from imu_calibration.segmentation.stamping import COUNTED
 
 SERIOUS = ('frame_id', 'not an Imu message', 'failed')
-"""Beginnings of the reasons for which a stream as a whole cannot be corrected."""
+"""Prefixes of the reasons for which no message of a stream can be corrected."""
 QUIET = 2.0
-"""Seconds without a message after which diagnostics say so."""
+"""Seconds without a message after which diagnostics report it."""
 ANOTHER_RATE = 0.1
 """Relative change of the period from which the stamps are worth another line."""
 COLD = 10.0
-"""Seconds without a temperature after which diagnostics say so; drivers send one per second."""
+"""Seconds without a temperature after which diagnostics report it; drivers send one per second."""
 HEALTH_LEVELS = {WAITING: OK, HOLDS: OK, FOLLOWED: OK, MOVED: WARN, HARMS: ERROR, UNIT: ERROR}
 KNOWN = {'no temperature yet': 'the calibration has thermal effects and no temperature was received: no messages are published',
          'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
@@ -36,7 +36,7 @@ KNOWN = {'no temperature yet': 'the calibration has thermal effects and no tempe
 
 
 class CompensatorDiagnostics:
-    """Collects the state of the node; what is wrong is logged when it begins and when it is over."""
+    """Collects the state of the node; a fault is logged at its beginning and at its end."""
 
     def __init__(self, node: Any):
         self._node, self._counts = node, {}
@@ -51,7 +51,7 @@ class CompensatorDiagnostics:
         self._publisher.publish_now()
 
     def note_temperature(self, temperature_c: float) -> bool:
-        """Take a temperature; return whether it can be used: finite, and degrees Celsius by its size."""
+        """Record a temperature; return whether it is usable: finite, and by its magnitude in degrees Celsius."""
         if not np.isfinite(temperature_c) or temperature_c > HOTTEST_C:
             self._unusable_temperatures = f'in degrees Celsius, {temperature_c:.1f} is kelvin' if temperature_c > HOTTEST_C else 'finite'
             return False
@@ -79,7 +79,7 @@ class CompensatorDiagnostics:
                 make_status(level, 'compensation', '; '.join(serious + notes) or good, values=self._values(), hardware_id=frame_id)]
 
     def _health(self, compensation, frame_id):
-        """Return a status that says whether the calibration still holds, and tell when it no longer does."""
+        """Return a status with the validity of the calibration; log the loss of validity."""
         if compensation is None:
             return []
         state = compensation.watch.health.state
@@ -92,7 +92,7 @@ class CompensatorDiagnostics:
                             hardware_id=frame_id)]
 
     def _stream(self, compensation):
-        """Return what is wrong with the stream of messages, and log where it comes from when it begins."""
+        """Return the faults of the message stream, and log its source when it begins."""
         node, received = self._node, self._node.uncorrected + (0 if compensation is None else compensation.received)
         if received != self._received:
             self._received, self._last_change = received, monotonic()
@@ -104,7 +104,7 @@ class CompensatorDiagnostics:
         return [node.imu.silence()] if monotonic() - self._last_change > QUIET else []
 
     def _tell_stamps(self, compensation):
-        """Say once how stamps are that are not simply regular; a rate that changes is another line."""
+        """Log irregular stamps once, and again when their rate changes."""
         line = None if compensation is None else compensation.slope.line
         if line is not None and (told := (line.word, round(np.log(line.period_ns) / ANOTHER_RATE))) != self._told_stamps:
             if (line.word == COUNTED or self._told_stamps is not None) and monotonic() - self._stamps_at.get(told, -np.inf) >= REMINDER:
@@ -113,7 +113,7 @@ class CompensatorDiagnostics:
             self._told_stamps = told
 
     def _lines(self, compensation):
-        """Return (what prevents correction, what should be known), one line each."""
+        """Return (faults that prevent correction, notes), one line each."""
         node = self._node
         serious = [node.corrected_already] if node.corrected_already else []
         if node.problem:
@@ -128,7 +128,7 @@ class CompensatorDiagnostics:
         return serious, notes + self._outside(compensation) + self._warmth(compensation)
 
     def _new_counts(self, compensation):
-        """Return the reasons of which there is more than at any call before: a calibration about to take over has counted nothing."""
+        """Return the reasons whose counts exceed their earlier maximum: the counts of a new compensation start at zero."""
         counts = dict(compensation.counts)
         new = {reason: count for reason, count in counts.items() if count > self._counts.get(reason, 0)}
         self._counts |= new
@@ -146,7 +146,7 @@ class CompensatorDiagnostics:
         return outside_conditions(compensation.calibration, np.array([[fastest, 0.0, 0.0]]), temperature)
 
     def _warmth(self, compensation):
-        """Return what is wrong with the temperature, when the calibration needs one."""
+        """Return the faults of the temperature, when the calibration needs one."""
         node = self._node
         if not compensation.needs_temperature or node.temperature is None:
             return []

@@ -41,15 +41,15 @@ from imu_calibration.nodes.topics import announce
 LOOK_FOR_FILE = 1.0
 """Seconds between two attempts to find a calibration file that is waited for."""
 MARK = '/correction'
-"""Behind the name of a corrected topic: a latched topic that says which calibration made it, and that it is corrected."""
+"""Suffix of a corrected topic's name: a latched topic that marks it as corrected and names the calibration."""
 
 
 class CompensatorNode(Node):
     """
     Corrects serialized messages with the calibration at hand.
 
-    Two threads: one takes, corrects and publishes messages; all else (documents, temperature, services, parameters, diagnostics) runs in
-    the other one, which prepares a new compensation; the first takes it over between two messages.
+    Two threads: one receives, corrects and publishes messages; documents, temperature, services, parameters and diagnostics run in
+    the second, which prepares a new compensation; the first switches to it between two messages.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -115,12 +115,12 @@ class CompensatorNode(Node):
             rclpy.spin(self)
 
     def close(self) -> str:
-        """End what is shown."""
+        """Close the view."""
         self._view.close()
         return ''
 
     def convert(self, data: bytes, information: dict) -> bytes | None:
-        """Return what to publish for a serialized message, or None."""
+        """Return the serialized message to publish, or None."""
         current = self._current
         if current is not self._wanted:
             current = self._take_over()
@@ -129,7 +129,7 @@ class CompensatorNode(Node):
             return data if self.settings.passthrough and current is None and not self.corrected_already else None
         try:
             return current(data, sent_ns(information))
-        except Exception as error:   # a message that nobody foresaw must not end the stream
+        except Exception as error:   # an unforeseen message must not end the stream
             current.counts[shortened(f'failed with {type(error).__name__}: {error}', 100)] += 1
             return None
 
@@ -150,7 +150,7 @@ class CompensatorNode(Node):
         return guarded(callback, self._failed)
 
     def _failed(self, error: Exception) -> None:
-        if self.context.ok():   # otherwise the node is ending, and nothing can be published any more
+        if self.context.ok():   # false while the node ends and publishing is impossible
             self.complaints.event('a message could not be used, the node continues unchanged: '
                                   + shortened(f'{type(error).__name__}: {error}', 200), ERROR)
 
@@ -216,7 +216,7 @@ class CompensatorNode(Node):
         self._adopt(files.read_text(path, 'calibration'), f'file {path}', settings)
 
     def _try(self, source: str, action: Callable, *arguments: Any) -> str:
-        """Do what may be refused; return why it was, '' when it was not."""
+        """Run an action; return the reason of its refusal, '' when it succeeded."""
         try:
             action(*arguments)
             return ''
@@ -232,7 +232,7 @@ class CompensatorNode(Node):
         return why
 
     def _on_transforms(self) -> None:
-        """Go on with what waited for a transform, or follow one that has moved."""
+        """Resume an adoption that waited for a transform, or apply a changed transform."""
         if self.awaited:
             self._retry()
         elif self.adopted is not None and has_moved(self.adopted, self.settings, self._frames):
@@ -254,7 +254,7 @@ class CompensatorNode(Node):
         return response
 
     def _change_compensation(self, settings: CompensatorSettings) -> None:
-        """Take changed parameters; raises an ImuCalibrationError and changes nothing."""
+        """Apply changed parameters; on an ImuCalibrationError all remain unchanged."""
         old, insists = self.settings, settings.anyway and not self.settings.anyway
         if settings.calibration_file and insists and not settings.takes_topic:
             self._load_file(settings)

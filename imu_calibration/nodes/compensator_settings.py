@@ -8,16 +8,16 @@ from imu_calibration.settings import setting
 FILE, TOPIC, FILE_THEN_TOPIC = 'file', 'topic', 'file_then_topic'
 ADOPT = (FILE, TOPIC, FILE_THEN_TOPIC)
 """
-Where calibrations are taken from.
+Source of the calibrations.
 
-By default a file that was named stays in force, whatever comes on the topic, and without one the topic is listened to: nobody who names a
-file wants it displaced by somebody else's session, and nobody who names none has another use for the node.
+By default a given file remains in force and the topic is ignored; without a file the topic is used. A user who gives a file does not want
+another session to replace it, and without a file the node has no other source.
 """
 
 
 @dataclass(frozen=True)
 class CompensatorSettings:
-    """What to correct with, where to, and how."""
+    """Calibration, target frame and options of the compensation."""
 
     calibration_file: str = setting('', '', 'calibration.yaml to correct with, read again on ~/reload; '
                                     'empty: wait for imu/calibration',
@@ -75,5 +75,5 @@ class CompensatorSettings:
 
     @property
     def takes_topic(self) -> bool:
-        """Whether calibrations that come on the topic are taken."""
+        """Whether calibrations received on the topic are adopted."""
         return self.adopt == TOPIC or (self.adopt == FILE_THEN_TOPIC and not self.calibration_file)

@@ -1,4 +1,4 @@
-"""What compensator_node shows to Foxglove: readings before and after, and whether the calibration still holds."""
+"""Foxglove view of compensator_node: readings before and after, and the validity of the calibration."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +16,7 @@ from imu_calibration.use_cases.view_messages import HEALTH, PARAMETERS, READINGS
 
 @dataclass(frozen=True)
 class CompensatorFoxglove(FoxgloveSettings):
-    """The same beside a calibration_node on the same host."""
+    """Port when a calibration_node runs on the same host."""
 
     foxglove_port: int = setting(8767, '', 'port to listen on, not that of foxglove_bridge or calibration_node; 0: any free port',
                                  (0, 65535),
@@ -25,19 +25,19 @@ class CompensatorFoxglove(FoxgloveSettings):
 
 
 class CompensatorView(LiveView):
-    """Shows what a compensation does: readings before and after with their band, what stops say of it, the parameters."""
+    """Shows a compensation: readings before and after with their band, the check at stops, the parameters."""
 
     def __init__(self, node: Any, settings: FoxgloveSettings):
         self._adopted: Adopted | None = None
         super().__init__(node, (READINGS, HEALTH, PARAMETERS), settings)
 
     def change(self, settings: FoxgloveSettings) -> None:
-        """Begin or end showing; while it is off the stream of messages knows nothing of it."""
+        """Open or close the view; while closed it does not affect the message stream."""
         super().change(settings)
         self._listen()
 
     def take_calibration(self, adopted: Adopted) -> None:
-        """Show what is in force."""
+        """Show the calibration in force."""
         self._adopted = adopted
         self.show(PARAMETERS, partial(parameters, adopted.used.calibration, tolerances_of(adopted.used.calibration.model)))
         self._listen()

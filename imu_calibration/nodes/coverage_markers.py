@@ -14,8 +14,8 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     """
     Return the picture, in the frame of the sensor; each message replaces the one before.
 
-    Cells: orange and large where a rest is still worth having, green and small where it is not. An arrow from what is up now to what shall
-    be up, a ring of the turn that leads there; blue points: what has been up; the arms of the three sensitive points; one line of text.
+    Cells: orange and large where another rest is informative, green and small elsewhere. An arrow from the present up direction to the
+    next one, a ring of the turn between them; blue points: earlier up directions; the arms of the three sensitive points; one line of text.
     """
     frame = coverage.frame_id or 'imu_link'
     made = [_marker('all', 0, Marker.SPHERE), *_cells(coverage), *_seen(coverage), *_next(coverage), *_arms(coverage), _text(coverage)]
@@ -26,7 +26,7 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
 
 
 def driven_markers(up: np.ndarray, text: str, *, frame_id: str, stamp: Time) -> MarkerArray:
-    """Return what the planner adds to the picture: an arrow to what will be up after the driven motion, and that motion in words."""
+    """Return the planner's markers: an arrow to the up direction after the driven motion, and a description of that motion."""
     made = [_arrow('driven', np.zeros(3), 1.25 * RADIUS * up, ARROW), _marker('driven', 1, Marker.TEXT_VIEW_FACING, scale=(0.0, 0.0, 0.08))]
     made[1].text = text
     _at(made[1], (0.0, 0.0, -1.5 * RADIUS))

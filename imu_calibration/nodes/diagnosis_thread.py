@@ -1,4 +1,4 @@
-"""The thread of the diagnosis of model errors: a diagnosis takes long, so neither the topics nor the solutions wait for it."""
+"""The thread of the diagnosis of model errors: a diagnosis is slow, and must delay neither the topics nor the solutions."""
 
 import threading
 import time

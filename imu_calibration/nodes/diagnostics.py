@@ -1,8 +1,8 @@
 """
-Diagnostics: what a node knows about itself, once per second on /diagnostics and at once when it changes.
+Diagnostics: the state of a node, once per second on /diagnostics and at once when it changes.
 
-Levels by convention: OK works as it should, a start included; WARN works and somebody should look; ERROR does not do what it is for. STALE
-is for those who listen, when nothing comes any more.
+Levels by convention: OK: works as intended, including the start; WARN: works and needs attention; ERROR: does not fulfil its purpose. STALE
+is set by the receiver when messages are missing.
 """
 
 from collections.abc import Callable, Mapping
@@ -28,7 +28,7 @@ def make_status(level: Any, name: str, message: str, *, values: Mapping[str, Any
     level : bytes
         `OK`, `WARN` or `ERROR`.
     name : str
-        What the status is about; the publisher puts the node's name in front.
+        Subject of the status; the publisher prepends the node's name.
     message : str
         One line.
     values : dict, optional
@@ -43,9 +43,9 @@ def make_status(level: Any, name: str, message: str, *, values: Mapping[str, Any
 
 class DiagnosticsPublisher:
     """
-    Publishes what `collect` returns (a list of DiagnosticStatus) every `PERIOD`, and on `publish_now`.
+    Publishes the list of DiagnosticStatus that `collect` returns every `PERIOD`, and on `publish_now`.
 
-    The timer runs on the steady clock, so that diagnostics go on while simulated time stands still.
+    The timer runs on the steady clock, so that diagnostics continue while simulated time is paused.
     """
 
     def __init__(self, node: Node, collect: Callable[[], list]):
@@ -54,10 +54,10 @@ class DiagnosticsPublisher:
         self._timer = every(node, PERIOD, self.publish_now)
 
     def publish_now(self) -> None:
-        """Publish the present state; when it cannot be told, that is told."""
+        """Publish the present state, or the error that prevents its collection."""
         try:
             statuses = self._collect()
-        except Exception as error:   # diagnostics must not end what they speak of
+        except Exception as error:   # diagnostics must not end their node
             statuses = [make_status(ERROR, 'diagnostics', shortened(f'state not available: {type(error).__name__}: {error}', 300))]
         array = DiagnosticArray(status=statuses)
         array.header.stamp = self._node.get_clock().now().to_msg()

@@ -1,4 +1,4 @@
-"""The first moments of a node: it ends without a traceback where ROS is not installed or an interrupt comes while modules are imported."""
+"""Start of a node: it ends without a traceback where ROS is not installed or an interrupt arrives during the imports."""
 
 import os
 import signal
@@ -10,14 +10,14 @@ NAMES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_n
 
 
 def end_quietly_while_importing() -> None:
-    """Let SIGINT end the process with exit code 0 until `lifecycle.run_node` takes over; does nothing in other programs."""
+    """Let SIGINT end the process with exit code 0 until `lifecycle.run_node` handles it; no effect in other programs."""
     if is_node_process():
-        # Nothing is open yet; an exception would go through whatever is being imported.
+        # No file is open yet; an exception would pass through the module under import.
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(0))
 
 
 def require_rclpy() -> None:
-    """End a node's process with one line and exit code 1 where ROS is not installed; does nothing in other programs."""
+    """End a node's process with one line and exit code 1 where ROS is not installed; no effect in other programs."""
     if is_node_process() and find_spec('rclpy') is None:
         print('a node needs ROS 2 (rclpy), it is not installed; source a ROS 2 Jazzy workspace, or use the command line imu_calibration, '
               'which needs no ROS', file=sys.stderr)

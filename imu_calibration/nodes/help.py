@@ -1,4 +1,4 @@
-"""What ``--help`` prints: what a node does, its topics and services, and every parameter with its default and meaning."""
+"""Text of ``--help``: purpose of a node, its topics and services, and every parameter with its default and meaning."""
 
 import inspect
 import sys

@@ -1,4 +1,4 @@
-"""Inputs: subscriptions that connect to any publisher, lose nothing of a reliable one, and know what is wrong with their topic."""
+"""Inputs: subscriptions that connect to any publisher, lose no message of a reliable one, and report faults of their topic."""
 
 import time
 from collections.abc import Callable
@@ -15,15 +15,15 @@ from imu_calibration.nodes.qos import DEPTH, input_qos, latched_qos
 from imu_calibration.nodes.timers import every
 
 PERIOD = 0.25
-"""Seconds between two looks at the publishers of the inputs."""
+"""Seconds between two checks of the publishers of the inputs."""
 SEVERAL_AFTER = 3.0
-"""Seconds after which several publishers of one topic are worth a word."""
+"""Seconds after which several publishers of one topic are reported."""
 DEAD_AFTER = 30.0
-"""The same when they have one name: for so long discovery may still know a node that was killed, beside the one that replaces it."""
+"""The same when they have one name: for so long discovery may still list a killed node in addition to its replacement."""
 NAP = 0.004
-"""Seconds a callback sleeps after it has taken all: at 2 kHz the executor then wakes once for eight messages."""
+"""Seconds a callback sleeps after it has read all messages: at 2 kHz the executor then wakes once for eight messages."""
 NOT_RAW = ('_corrected', '/residual', '/truth')
-"""Endings of topics that this package publishes, which nobody means to listen to instead."""
+"""Suffixes of topics that this package publishes, which are not suggested as replacements."""
 SHOWN = 3
 """Other topics that are named at most."""
 
@@ -37,8 +37,8 @@ class MatchedInput:
     """
     A subscription as reliable as the publishers of its topic.
 
-    It asks for reliability, so that nothing is lost of a publisher that offers it, until a publisher appears that does not: such a
-    publisher would never connect. When the last one is gone it asks again.
+    It requests reliability, so that no message of a reliable publisher is lost, until a best-effort publisher appears: that
+    publisher would never connect. When the last best-effort publisher has disappeared it requests reliability again.
 
     Parameters
     ----------
@@ -47,14 +47,14 @@ class MatchedInput:
     topic : str
         Relative name, as in a remapping.
     callback : callable
-        Called with each message, and what the middleware says of it when it takes two arguments.
+        Called with each message, and with the middleware's message information if it has two parameters.
     depth : int
         Messages that may wait.
     group : CallbackGroup, optional
     single : bool
         Whether several publishers at once are a fault.
     raw : bool
-        Whether messages come serialized.
+        Whether messages are passed serialized.
     latched : bool
         Whether the last message that was sent before is wanted too; its publisher is then reliable.
 
@@ -76,14 +76,14 @@ class MatchedInput:
         return self.subscription.topic_name
 
     def _subscribe(self) -> Subscription:
-        # Without callbacks of our own rclpy warns of every publisher that offers less than is asked for, before we ask for less.
+        # With its default callbacks rclpy warns of every publisher that offers less than requested, before we request less.
         silent = SubscriptionEventCallbacks(use_default_callbacks=False)
         qos = latched_qos() if self._latched else input_qos(self.reliable, self._depth)
         return self.node.create_subscription(self.message_type, self.topic, self._callback, qos, callback_group=self._group,
                                              event_callbacks=silent, raw=self._raw)
 
     def look(self) -> None:
-        """Note who publishes, and subscribe anew when that asks for another reliability."""
+        """Record the publishers, and subscribe again when they require another reliability."""
         several, known = self.mixed, self.node.get_publishers_info_by_topic(self.topic_name)
         self.publishers = [found for found in known if found.topic_type == self.type_name]
         self.others = [found for found in known if found.topic_type != self.type_name]
@@ -107,7 +107,7 @@ class MatchedInput:
         return [node_of(found) for found in self.publishers]
 
     def faults(self) -> list[str]:
-        """Return what is wrong with the topic, a line each."""
+        """Return the faults of the topic, a line each."""
         names = self.names()
         patience = DEAD_AFTER if len(set(names)) == 1 else SEVERAL_AFTER
         if not self.single or self._several_since is None or time.monotonic() - self._several_since < patience:
@@ -116,12 +116,12 @@ class MatchedInput:
                 f'or remap {self.topic}']
 
     def source(self) -> str:
-        """Return where messages come from, for people."""
+        """Return the source of the messages, readable."""
         return f'{self.topic_name} from {", ".join(sorted(set(self.names()))) or "an unknown node"}, ' + (
             'reliable' if self.reliable else 'best effort')
 
     def silence(self, unusable: str = '') -> str:
-        """Return why nothing may come on the topic, and which other topic there is; `unusable` says what was dropped of what does come."""
+        """Return the likely reason of a silent topic, and a similar topic; `unusable` describes received messages that were dropped."""
         if unusable:
             return f'no message on {self.topic_name} is usable: {unusable}'
         what = f'no messages on {self.topic_name} ({self.type_name})'
@@ -143,10 +143,10 @@ class MatchedInput:
 
 class BatchInput(MatchedInput):
     """
-    An input whose callback hands on all waiting messages at once, so that thousands per second cost little.
+    An input whose callback passes on all waiting messages at once, which is efficient for thousands per second.
 
-    The public executor calls it for the first one; the others are taken through the subscription's handle. Where rclpy has no such
-    handle every message comes by itself, which is slower and otherwise the same.
+    The public executor calls it for the first one; the following ones are read through the subscription's handle. Where rclpy has no such
+    handle every message has its own call, which is slower with the same result.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ class BatchInput(MatchedInput):
             time.sleep(NAP)
 
     def drain(self) -> bool:
-        """Hand on what waits; return whether that is possible here."""
+        """Pass on all waiting messages; return whether the handle allows it."""
         take = getattr(getattr(self.subscription, 'handle', None), 'take_message', None)
         if take is None:
             return False
@@ -175,12 +175,12 @@ class BatchInput(MatchedInput):
 
 
 def sent_ns(information: dict) -> int:
-    """Return when a message was sent, or where the middleware does not tell, received; ns."""
+    """Return the time of sending of a message, ns; the time of reception where the middleware has none."""
     return information['source_timestamp'] or information['received_timestamp']
 
 
 def watch_inputs(node: Node, inputs: list[MatchedInput]) -> None:
-    """Look at the publishers of inputs from now on, by the steady clock."""
+    """Check the publishers of the inputs periodically, by the steady clock."""
     def look() -> None:
         for each in inputs:
             each.look()

@@ -1,7 +1,7 @@
 """
-Ways to ask a controller for a motion: its topic, or its action where control_msgs is installed.
+Interfaces to command a controller: its topic, or its action where control_msgs is installed.
 
-The topic is fire and forget: what became of a trajectory is seen in the joint states alone. The action says why it refuses one.
+The topic has no feedback: the result of a trajectory shows only in the joint states. The action returns the reason of a refusal.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ COMMANDS = ('topic', 'action', 'auto')
 DEPTH = 10
 RESULTS = {-1: 'the goal is invalid', -2: 'the joints are not those of the controller', -3: 'the stamp is old', -4: 'a joint left the path',
            -5: 'a joint did not reach the end'}
-"""Error codes of FollowJointTrajectory, in words."""
+"""Descriptions of the error codes of FollowJointTrajectory."""
 
 
 class TopicCommand:
@@ -39,7 +39,7 @@ class TopicCommand:
 
     @property
     def is_heard(self) -> bool:
-        """Whether somebody listens."""
+        """Whether a controller is connected."""
         return self._publisher.get_subscription_count() > 0
 
     def send(self, points: TrajectoryPoints) -> None:
@@ -53,7 +53,7 @@ class TopicCommand:
 
 class ActionCommand:
     """
-    Sends trajectories as goals of FollowJointTrajectory; a stop cancels the goal, and goes to the topic as well.
+    Sends trajectories as goals of FollowJointTrajectory; a stop cancels the goal, and is sent to the topic as well.
 
     Parameters
     ----------
@@ -90,8 +90,8 @@ class ActionCommand:
         self._client.send_goal_async(goal).add_done_callback(self._guarded(lambda future: self._answered(number, future.result())))
 
     def stop(self, joint_names: tuple[str, ...]) -> None:
-        """Cancel the goal, and send the trajectory without points: whichever comes first stops the joints."""
-        self._number += 1   # what becomes of the goal is no news any more
+        """Cancel the goal, and send the trajectory without points: the first to arrive stops the joints."""
+        self._number += 1   # the result of the goal is not reported any more
         handle, self._handle = self._handle, None
         self._topic.stop(joint_names)
         if handle is not None:
@@ -99,7 +99,7 @@ class ActionCommand:
 
     def _answered(self, number: int, handle: Any) -> None:
         self.goals.add(bytes(handle.goal_id.uuid))
-        if number != self._number:   # stopped before the server had answered
+        if number != self._number:   # stopped before the server's response
             if handle.accepted:
                 handle.cancel_goal_async()
             return
@@ -124,12 +124,12 @@ class ActionCommand:
 
 def make_command(node: Node, how: str, refused: Callable[[str], None]) -> TopicCommand | ActionCommand:
     """
-    Return the way to command joints that `how` (one of `COMMANDS`) says.
+    Return the interface to command joints that `how` (one of `COMMANDS`) selects.
 
     Raises
     ------
     InputError
-        When it is none of them, or asks for an action without control_msgs.
+        When it is not in `COMMANDS`, or requires an action without control_msgs.
 
     """
     if how not in COMMANDS:

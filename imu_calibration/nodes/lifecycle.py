@@ -1,4 +1,4 @@
-"""From start to end of a node's process: exit code 0 after SIGINT and SIGTERM, one line and 1 when it cannot run or go on."""
+"""From start to end of a node's process: exit code 0 after SIGINT and SIGTERM, one line and 1 when it cannot run or continue."""
 
 import signal
 import sys
@@ -20,20 +20,20 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 HEARD = 0.1
 """Seconds within which the interpreter has heard of a signal; rclpy hears first, and ends the context."""
 LOOK_AGAIN = 0.5
-"""Seconds after which a node that waits without work looks whether it was asked to end."""
+"""Seconds after which an idle node checks whether its end was requested."""
 
 
 def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = None, *, spin: Callable[[Any], None] | None = None,
              hints: dict[str, str] | None = None) -> int:
     """
-    Run one node until the process is asked to end, and return the exit code.
+    Run one node until a signal ends the process, and return the exit code.
 
     Parameters
     ----------
     make_node : callable
-        Returns the node; its class gives the text of ``--help``. A method `close` of the node is called before it is destroyed, what
-        it returns is printed; a class with a method `halt` has it called at the first signal, while the context still lives and messages
-        can be sent; an attribute `failed` says whether it ended because it could not go on, and has said so.
+        Returns the node; its class gives the text of ``--help``. A method `close` of the node is called before it is destroyed, and
+        its result is printed; a method `halt` is called at the first signal, while the context is still valid and messages
+        can be sent; an attribute `failed` is true when the node ended because it could not continue, and has reported it.
     arguments : list of str, optional
         Command line without the program's name; default ``sys.argv[1:]``.
     spin : callable, optional
@@ -45,7 +45,7 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     own = remove_ros_args(['', *arguments])[1:]
     if '-h' in own or '--help' in own:
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)   # whoever reads may stop reading
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)   # the reader of a pipe may close it
         print(help_text(make_node))
         return 0
     if own:
@@ -63,12 +63,12 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
             rclpy.try_shutdown()
     for number in SIGNALS:
         signal.signal(number, asked)
-    told = sys.unraisablehook   # what rclpy leaves half made when the context ends is no news either
+    told = sys.unraisablehook   # incomplete objects of rclpy at the end of the context are not reported either
     sys.unraisablehook = lambda unraisable: None if asked_to_end else told(unraisable)
-    # Who has to say something at the end keeps the context until it is said.
+    # A node with a final message needs the context until it is sent.
     rclpy.init(args=arguments, **({'signal_handler_options': SignalHandlerOptions.NO} if halts else {}))
     try:
-        if asked_to_end:   # before rclpy could take note of it
+        if asked_to_end:   # before rclpy's handlers were installed
             return 0
         node = make_node()
         for line in unknown_parameters(node):
@@ -92,10 +92,10 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
 
 def _look_again(node: Any) -> None:
     """
-    Let the executor wake from time to time.
+    Wake the executor periodically.
 
-    At a signal rclpy wakes the executor first and ends the context second: who finds the context still alive in between waits again, and
-    nothing would wake it any more.
+    At a signal rclpy wakes the executor first and ends the context second: an executor that checks the context in between waits again, and
+    no event would wake it any more.
     """
     every(node, LOOK_AGAIN, lambda: None)
 
@@ -106,14 +106,14 @@ def _failed(line: str) -> int:
 
 
 def _end(node: Any) -> None:
-    _ignore_signals()   # `ros2 launch` sends every signal twice, and the second must not cut off what is being saved
+    _ignore_signals()   # `ros2 launch` sends every signal twice, and the second must not interrupt saving
     if node is not None:
         last_words = node.close() if hasattr(node, 'close') else ''
         if last_words:   # a logger would also publish, and complain that it cannot any more
             print(f'[{node.get_name()}]: {last_words}', file=sys.stderr, flush=True)
         node.destroy_node()
     rclpy.try_shutdown()
-    _ignore_signals()   # rclpy has put back what it had found
+    _ignore_signals()   # rclpy has restored the earlier handlers
 
 
 def _ignore_signals() -> None:

@@ -1,4 +1,4 @@
-"""The live picture of a node for Foxglove: there while parameter 'foxglove' asks for it; without it the node goes on as it was."""
+"""The live view of a node for Foxglove: open while parameter 'foxglove' is true; without it the node runs unchanged."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class FoxgloveSettings:
 
 class LiveView:
     """
-    What a node shows, remembered while nobody asks for it, so that it can be turned on at any moment.
+    The view of a node, stored while it is off, so that it can be turned on at any moment.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class LiveView:
         if self.is_on and not settings.foxglove:
             self.close()
         elif settings.foxglove and not self.is_on:
-            from imu_calibration.use_cases.foxglove_server import FoxgloveServer  # a second of imports, for those who ask for it
+            from imu_calibration.use_cases.foxglove_server import FoxgloveServer  # a second of imports, only on request
             self._server = FoxgloveServer(self._node.get_fully_qualified_name(), host=settings.foxglove_host, port=settings.foxglove_port,
                                           topics=self._topics, clock=lambda: self._node.get_clock().now().nanoseconds,
                                           complain=self._complaints.event)
@@ -68,13 +68,13 @@ class LiveView:
             self._node.get_logger().info(f'Foxglove finds it at {self._server.address}')
 
     def show(self, topic: str, make: Callable[[], Any]) -> None:
-        """Show what `make` returns from now on."""
+        """Show the result of `make` from now on."""
         self._latest[topic] = make
         if self._server is not None:
             self._server.show(topic, make)
 
     def add(self, topic: str, make: Callable[[], Any]) -> None:
-        """Send what `make` yields, (time in ns, content) each, where somebody looks."""
+        """Send the pairs (time in ns, content) that `make` yields, if a client is connected."""
         if self._server is not None:
             self._server.add(topic, make)
 

@@ -1,4 +1,4 @@
-"""Serialized Imu message in, corrected serialized message out, with one calibration; knows nothing of ROS."""
+"""Serialized Imu message in, corrected serialized message out, with one calibration; independent of ROS."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from msg_adapters.imu_stream import ImuStream
 from msg_adapters.stamps import MessageError
 
 MANY = 30
-"""Reasons that are counted apart at most, so that memory stays bounded whatever comes."""
+"""Largest number of reasons with separate counts: it bounds the memory."""
 ABSENT = -1.0
 """First element of the covariance of a quantity that the message does not have."""
 
@@ -33,7 +33,7 @@ class LiveCompensation(SampleCompensation):
     correct_stamps : bool
         Whether the stamps are moved back by the calibration's time_offset.
     watch : StopWatch, optional
-        Looks at the stops, and may take off what they show.
+        Evaluates the stops, and may subtract the bias that they show.
 
     """
 
@@ -50,19 +50,19 @@ class LiveCompensation(SampleCompensation):
         self._can_saturate = any(np.isfinite(self.levels))
 
     def follow(self, before: 'LiveCompensation') -> None:  # type: ignore[override]
-        """Go on where another compensation stops."""
+        """Continue from the state of another compensation."""
         super().follow(before)
         self.received = before.received
 
     def __call__(self, data: bytes, sent_ns: int = 0) -> bytes | None:
         """
-        Return the corrected message as bytes, or None when there is nothing to publish; `counts` says why.
+        Return the corrected message as bytes, or None when there is no message to publish; the reason is counted in `counts`.
 
         Parameters
         ----------
         data : bytes
         sent_ns : int
-            When it was sent or received, which stands for the stamp where a driver sets none.
+            Time of sending or reception, which replaces the stamp where a driver sets none.
 
         """
         self.received += 1
@@ -117,7 +117,7 @@ class LiveCompensation(SampleCompensation):
         return True
 
     def _take_covariances(self, data):
-        """Propagate covariances that differ from those of the message before."""
+        """Propagate covariances that differ from the previous message's."""
         self._taken = self.revision
         given = self._message.covariances(data)
         self._no_force, self._no_rate = absent = [bool(cov[0, 0] == ABSENT) for cov in given]
@@ -129,7 +129,7 @@ class LiveCompensation(SampleCompensation):
         self._force_cov, self._rate_cov = (self._message.packed(cov if missing else new) for cov, new, missing in zip(given, found, absent))
 
     def _mixed(self, of_absent, of_present):
-        """Return six readings: those of an absent sensor from the first, of the other one from the second."""
+        """Return six readings: of an absent sensor from the first, of the present sensor from the second."""
         return (of_absent if self._no_rate else of_present)[:3] + (of_absent if self._no_force else of_present)[3:]
 
     def _marked(self, readings):

@@ -1,9 +1,9 @@
 """
 Parameter files of the nodes, written from the settings that the nodes declare: ``make config``.
 
-A setting is declared once, in the settings of its node, with default, unit, meaning, bounds and what a wrong value looks like. What names
-the things that a session works on (table, calibration, bag) stands there as a comment: a file that set it to its default would undo
-what a command line said before it.
+A setting is declared once, in the settings of its node, with default, unit, meaning, bounds and symptom of a wrong value. Names of
+the inputs of a session (table, calibration, bag) are comments in the file: a default set there would override
+an earlier argument of the command line.
 """
 
 import ast
@@ -18,7 +18,7 @@ NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_n
 
 
 def main(folder: Path = Path(__file__).resolve().parents[2] / 'config') -> None:
-    """Write one file for each node, and say which have changed."""
+    """Write one file for each node, and print which have changed."""
     for node in NODES:
         path = folder / f'{node}.yaml'
         text = rendered(node)
@@ -48,7 +48,7 @@ def rendered(node: str) -> str:
 
 
 def meaning(item: Setting) -> str:
-    """Return what a setting means, with unit and range."""
+    """Return the meaning of a setting, with unit and range."""
     return item.text + (f' [{item.unit}]' if item.unit not in ('', '1') else '') + range_text(item.bounds)
 
 

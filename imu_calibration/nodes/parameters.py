@@ -1,4 +1,4 @@
-"""ROS parameters made from the settings that the package declares once: declared, changed while a node runs, told when misspelt."""
+"""ROS parameters made from the settings that the package declares once: declared, changed while a node runs, reported when misspelt."""
 
 import math
 import sys
@@ -31,7 +31,7 @@ def declare_parameters(node: Node, group: type, take: Callable[[Any], None] | No
     """
     Declare every field of the settings `group` as a parameter of `node` and return the settings with the given values.
 
-    Tuples become arrays. From then on a request to change a parameter is answered: a setting declared `live` changes, of any other setting
+    Tuples become arrays. From then on requests to change a parameter are handled: a setting declared `live` changes, of any other setting
     the request is rejected with the reason.
 
     Parameters
@@ -63,7 +63,7 @@ def declare_parameters(node: Node, group: type, take: Callable[[Any], None] | No
 
 
 def parameter_descriptor(item: Setting) -> ParameterDescriptor:
-    """Return the descriptor of one setting: type, meaning, unit, range, what a wrong value looks like, why it cannot be changed."""
+    """Return the descriptor of one setting: type, meaning, unit, range, symptom of a wrong value, reason why it is fixed."""
     text = f'{item.text} [{item.unit}]' if item.unit else item.text
     descriptor = ParameterDescriptor(name=item.name, description=text, read_only=item.path)
     notes = [f'When wrong: {item.symptom}.'] * bool(item.symptom) + [f'Fixed while the node runs: {item.fixed}.'] * (not item.live)
@@ -81,7 +81,7 @@ def parameter_descriptor(item: Setting) -> ParameterDescriptor:
 
 @dataclass
 class _Group:
-    """A group of settings whose parameters a node has."""
+    """A group of settings that are parameters of a node."""
 
     settings: Any
     take: Callable[[Any], None] | None
@@ -89,7 +89,7 @@ class _Group:
 
 
 def _watch(node: Node, group: _Group) -> None:
-    """Answer requests to change the parameters of a group: one callback per node, for all its groups."""
+    """Handle requests to change the parameters of a group: one callback per node, for all its groups."""
     groups = getattr(node, _GROUPS, None)
     if groups is None:
         groups = []
@@ -111,7 +111,7 @@ def _set(groups: list[_Group], parameters: list) -> SetParametersResult:
                 group.settings = settings
     except ImuCalibrationError as error:
         return SetParametersResult(successful=False, reason=error.told(hints))
-    except Exception as error:   # the requester gets an answer, and the node continues unchanged
+    except Exception as error:   # the requester receives a response, and the node continues unchanged
         return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
     return SetParametersResult(successful=True)
 
@@ -131,7 +131,7 @@ def _change(groups: list, parameter: Any) -> None:
 
 
 def unknown_parameters(node: Node) -> list[str]:
-    """Return a line for each parameter that `node` was given and does not have: they are ignored, which nobody would notice."""
+    """Return a line for each given parameter that `node` does not have: ROS ignores it silently."""
     given = getattr(node, '_parameter_overrides', {})
     lines = []
     for name in sorted(given):

@@ -57,13 +57,13 @@ from msg_adapters.joint_state import joint_row
 from msg_adapters.stamps import UnusableMessage
 
 PERIOD = 0.1
-"""Seconds between two looks at the clock."""
+"""Seconds between two checks of the clock."""
 ANSWER_PATIENCE = 60.0
 """Seconds to wait for a solution, and for a diagnosis that has begun."""
 
 
 class PlannerNode(Node):
-    """Listens to the joints, and does what its worker decides."""
+    """Receives the joint states, and executes the decisions of its worker."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('planner_node', **options)
@@ -116,13 +116,13 @@ class PlannerNode(Node):
             self.get_logger().warning(line)
 
     def close(self) -> str:
-        """Stop what moves; return what became of it."""
-        unstopped = self.driver.is_driving   # the context is gone, and nothing can be sent any more
+        """Stop the joints; return the outcome."""
+        unstopped = self.driver.is_driving   # the context has ended, and no message can be sent
         self.worker.end()
         return 'the joints finish the motion that they are in' if unstopped else 'stopped in mid-motion' if self._is_halted else ''
 
     def halt(self) -> None:
-        """Stop what moves; called at the first signal, while that can still be said."""
+        """Stop the joints; called at the first signal, while messages can still be sent."""
         if self.driver.is_driving:
             self._is_halted = True
             self.worker.halt('the node is ending')
@@ -158,7 +158,7 @@ class PlannerNode(Node):
                                       frame_id=calibration.frame_id if calibration else '', stamp=self.get_clock().now().to_msg())
         self._coverage.publish(self._driven)
 
-    # What arrives.
+    # Received messages.
 
     def _joint_state(self, serialized: bytes, _: int) -> None:
         try:
@@ -224,7 +224,7 @@ class PlannerNode(Node):
         self._command.stop(self._names)
         self._diagnostics.publish_now()
 
-    # What the worker asks.
+    # Requests of the worker.
 
     def _latest(self) -> Calibration | None:
         with self._heard:
@@ -262,7 +262,7 @@ class PlannerNode(Node):
             told = dict(self._told)
         return findings_from(told) if came else None
 
-    # What people ask.
+    # Requests of the user.
 
     def _go(self, motions: int) -> tuple[bool, str]:
         if self.driver.is_driving or self.worker.doing:
@@ -309,7 +309,7 @@ class PlannerNode(Node):
             say(self.get_logger(), level, line)
 
     def _statuses(self) -> list:
-        if self._driven is not None:   # again, since calibration_node's picture begins with clearing everything
+        if self._driven is not None:   # again, because calibration_node's markers begin with DELETEALL
             self._coverage.publish(self._driven)
         return drive_statuses(self.driver, self.worker, self._command.name, faults=self._joints.faults() + self._calibrations.faults())
 

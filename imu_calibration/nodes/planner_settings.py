@@ -11,7 +11,7 @@ from imu_calibration.simulation.sensor_noise import GRADES
 
 @dataclass(frozen=True)
 class PlannerNodeSettings:
-    """What is moved, for which parameters, and how it is commanded."""
+    """Moved joints, parameters to determine, and interface of the commands."""
 
     table_file: str = setting('', '', 'description of the table with the limits of its joints, path; empty: urdf_file describes the arm',
                               symptom='other joints, or limits that are not theirs', session=True, path=True)

@@ -1,7 +1,7 @@
 """
-The thread behind planner_node: what next, when the joints rest.
+The thread of planner_node that selects the next motion when the joints rest.
 
-Plans, questions and answers take their time, and the joints are watched meanwhile.
+Planning and service calls are slow; the joints are monitored meanwhile.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from imu_calibration.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.nodes.complaints import ERROR, INFO
 
 PERIOD = 0.05
-"""Seconds between two looks at the driver."""
+"""Seconds between two checks of the driver."""
 
 
 @dataclass(frozen=True)
 class Peers:
-    """What the worker asks of others; each answers or gives None when no answer comes in time."""
+    """Requests of the worker to other nodes; each returns None when no response arrives in time."""
 
     measure: Callable[[], Any]
-    """Returns the calibration (a document) that has everything seen so far."""
+    """Returns the calibration (a document) of all data so far."""
     latest: Callable[[], Any]
     """Returns the last calibration that was heard of."""
     diagnose: Callable[[], list[Suspect] | None]
-    """Returns what the model gets wrong, the strongest first."""
+    """Returns the detected model errors, the strongest first."""
     send: Callable[[Any], None]
     """Sends a trajectory."""
     stop: Callable[[], None]
     """Stops the joints."""
     say: Callable[[str, str], None]
-    """Tells a person (level, line)."""
+    """Reports (level, line) to the user."""
     obstacle: Callable[[], str] = lambda: ''
-    """Returns why nothing may be sent at present, '' for nothing."""
+    """Returns the reason why no command may be sent at present, '' for none."""
 
 
 class PlannerWorker(threading.Thread):
@@ -51,7 +51,7 @@ class PlannerWorker(threading.Thread):
     driver : Driver
         Guarded by `lock`: the thread that hears the joint states uses it as well.
     make_campaign : callable
-        Returns a new Campaign; takes seconds.
+        Returns a new Campaign; runs for seconds.
     peers : Peers
     lock : threading.RLock
 
@@ -62,11 +62,11 @@ class PlannerWorker(threading.Thread):
         self.driver, self._make_campaign, self._peers, self._lock = driver, make_campaign, peers, lock
         self.campaign: Campaign | None = None
         self.doing = ''
-        """What the thread is busy with, in words."""
+        """Description of the present activity."""
         self.motion: Any = None
         """The motion that is driven, or was driven last."""
         self.seconds = 0.0
-        """How long it was to take."""
+        """Expected duration of the present activity, s."""
         self.worst: tuple[str, float] = ('', 0.0)
         self.outside = 0
         """Parameters outside their tolerance."""
@@ -98,11 +98,11 @@ class PlannerWorker(threading.Thread):
         self._peers.stop()
 
     def forget(self) -> None:
-        """Plan anew at the next start."""
+        """Plan again at the next start."""
         self.campaign = None
 
     def end(self, timeout: float = 10.0) -> None:
-        """End the thread, and stop what moves."""
+        """End the thread, and stop the joints."""
         self._ending = True
         self._wake.set()
         if self.driver.is_driving:
@@ -120,7 +120,7 @@ class PlannerWorker(threading.Thread):
                     self._next()
                 except ImuCalibrationError as error:
                     self._give_up(str(error))
-                except Exception as error:   # whatever fails must not leave the joints to themselves
+                except Exception as error:   # no failure may leave the joints without supervision
                     self._give_up(f'planning failed: {shortened(f"{type(error).__name__}: {error}", 200)}')
                 self.doing = ''
 
@@ -131,7 +131,7 @@ class PlannerWorker(threading.Thread):
         self._peers.say(ERROR, why)
 
     def _next(self):
-        if self.driver.state is DriveState.STOPPED:   # by what was seen of the joints
+        if self.driver.state is DriveState.STOPPED:   # because of the joint states
             self._wanted = 0
             return
         if self.campaign is None:
@@ -161,7 +161,7 @@ class PlannerWorker(threading.Thread):
             self.doing = 'waiting until the joints rest'
             if trouble := self.driver.stamp_fault(time.monotonic()):
                 raise InputError(trouble)
-            if self.driver.awaits_stop and not self.driver.is_silent(time.monotonic()):   # nobody need be looked for yet
+            if self.driver.awaits_stop and not self.driver.is_silent(time.monotonic()):   # no other driver need be searched for yet
                 self.doing, end = 'waiting for the controller to stop', time.monotonic() + patience
             if time.monotonic() > end:
                 raise InputError(f'the joints must rest before a motion begins, they moved for {patience:g} s; find the cause')
@@ -195,7 +195,7 @@ class PlannerWorker(threading.Thread):
                 self.driver.finish(decision.why)
             self._peers.say(INFO, f'done after {self.driver.motions} motions: {decision.why}')
             return
-        self._wait_for_rest()   # somebody may have turned the joints while the plan was made
+        self._wait_for_rest()   # the joints may have been turned during planning
         if obstacle := self._peers.obstacle():
             raise InputError(obstacle)
         with self._lock:
@@ -209,7 +209,7 @@ class PlannerWorker(threading.Thread):
 
 
 def findings_from(told: dict[str, str]) -> list[Suspect]:
-    """Return what the values of calibration_node's status 'diagnosis' say, the strongest first."""
+    """Return the model errors in the values of calibration_node's status 'diagnosis', the strongest first."""
     if told.get('outcome') != FOUND:
         return []
     found = [(key.removeprefix(MATES), value.split()) for key, value in told.items() if key.startswith(MATES)]

@@ -1,4 +1,4 @@
-"""Publishing serialized messages at their times: in real time, faster, or as fast as they are taken."""
+"""Publishing serialized messages at their times: in real time, faster, or as fast as subscribers receive them."""
 
 import queue
 import threading
@@ -15,7 +15,7 @@ from rosgraph_msgs.msg import Clock
 AHEAD = 3
 """Batches that are made ahead of their time."""
 SHORTEST_SLEEP = 0.001
-"""Seconds; messages that are due by then go out together."""
+"""Seconds; messages that are due by then are published together."""
 DEPTH = 20_000
 """Messages that wait for a slow reliable subscriber: some seconds of a fast stream."""
 
@@ -27,7 +27,7 @@ class Batch:
     time: np.ndarray
     """When each is due, s since the start, not falling, shape (n,)."""
     publisher: list
-    """Which publisher each goes to."""
+    """Publisher of each message."""
     messages: list
     """Serialized messages (bytes or memoryviews)."""
     until: float
@@ -36,7 +36,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast messages go out."""
+    """Rate of publication."""
 
     factor: float = 1.0
     """Seconds of messages per second; 0: as fast as possible."""
@@ -59,7 +59,7 @@ class Playback(threading.Thread):
     clock_start_ns : int
         Time on /clock at the start.
     awaited : list of Publisher
-        Those whose subscribers are waited for.
+        Publishers whose subscribers are waited for.
     on_end : callable
         Called when all is out, or with the exception that ended it.
 
@@ -159,7 +159,7 @@ class Playback(threading.Thread):
         self._clock.publish(message)
 
     def _settle(self):
-        """Stay until reliable subscribers have got everything; acknowledgements come with heartbeats, every three seconds."""
+        """Wait until reliable subscribers have received all messages; acknowledgements arrive with heartbeats, every three seconds."""
         for publisher in self._publishers:
             publisher.wait_for_all_acked(Duration(seconds=10.0))
         self._ending.wait(0.5)

@@ -11,11 +11,11 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 END_TIMEOUT = 30.0
-"""Seconds a node may take to end."""
+"""Longest time for a node to end, s."""
 
 
 def local_environment(domain_id: int) -> dict[str, str]:
-    """Return an environment in which DDS stays on this host and in a domain of its own."""
+    """Return an environment in which DDS is limited to this host and a separate domain."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))
     return {**os.environ, 'ROS_DOMAIN_ID': str(domain_id), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'PYTHONPATH': path,
             'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
@@ -58,20 +58,20 @@ def _text(value):
 
 
 class NodeProcesses:
-    """Processes of one DDS domain; as a context manager it leaves none behind."""
+    """Processes of one DDS domain; as a context manager it ends all of them."""
 
     def __init__(self, domain_id: int):
         self.environment, self.running = local_environment(domain_id), []
 
     def start(self, name: str, parameters: Mapping | None = None, output: Any = None, **options: Any) -> subprocess.Popen:
-        """Start a node (see `node_command`) and return its Popen; `output` is a file for what it prints."""
+        """Start a node (see `node_command`) and return its Popen; `output` is a file for its output."""
         process = subprocess.Popen(node_command(name, parameters, **options), env=self.environment, stdout=output, stderr=output,
                                    stdin=subprocess.DEVNULL)
         self.running.append(process)
         return process
 
     def end(self, process: subprocess.Popen, number: int = signal.SIGINT, timeout: float = END_TIMEOUT) -> int:
-        """Send a signal and return the exit code; kill what does not end in time."""
+        """Send a signal and return the exit code; kill a process that does not end in time."""
         if process.poll() is None:
             process.send_signal(number)
         try:

@@ -7,7 +7,7 @@ DEPTH = 1000
 
 
 def input_qos(reliable: bool = False, depth: int = DEPTH) -> QoSProfile:
-    """Return the profile of an input (`inputs.MatchedInput`): `reliable` asks again for what is lost, best effort takes any publisher."""
+    """Return the profile of an input (`inputs.MatchedInput`): `reliable` repeats lost messages, best effort accepts any publisher."""
     return _last(depth, ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
 
 
@@ -17,7 +17,7 @@ def output_qos(depth: int = DEPTH) -> QoSProfile:
 
 
 def latched_qos() -> QoSProfile:
-    """Return the profile of the calibration document: who comes late gets the last one."""
+    """Return the profile of the calibration document: a late subscriber receives the last one."""
     return _last(1, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
 
 

@@ -1,7 +1,7 @@
 """
 From a subscription to a publisher as serialized bytes, without the executor in between.
 
-The wait set and the handles are inner parts of rclpy; `available` says whether they are there. All other callbacks of the
+The wait set and the handles are internals of rclpy; `available` returns whether they exist. All other callbacks of the
 node run in a second thread with the public executor.
 """
 
@@ -25,15 +25,15 @@ except ImportError:
     _inner = None
 
 BATCH = 256
-"""Messages taken in a row at most before the context is looked at."""
+"""Largest number of messages read in a row before the context is checked."""
 WAIT_NS = 100_000_000
-"""Longest wait, after which another subscription may have taken the place of the one that is waited for; a signal ends it at once."""
+"""Longest wait, s, after which a replaced subscription is noticed; a signal ends it at once."""
 SWITCH_INTERVAL = 5e-4
 """The message thread gets the interpreter back from the other thread within this time, s."""
 
 
 class OutsideExecutor(CallbackGroup):
-    """Callbacks that the executor never takes: their subscription is read by `relay`."""
+    """Callbacks that the executor never runs: their subscription is read by `relay`."""
 
     def can_execute(self, _entity: Any) -> bool:
         """Return False: never by the executor."""
@@ -57,7 +57,7 @@ def available() -> bool:
 
 def relay(node: Node, source: MatchedInput, publisher: Publisher, *, convert: Callable[[bytes, dict], Any]) -> None:
     """
-    Publish what `convert` makes of each message until the context ends.
+    Publish the result of `convert` for each message until the context ends.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def relay(node: Node, source: MatchedInput, publisher: Publisher, *, convert: Ca
         In a callback group `OutsideExecutor`; its subscription may change.
     publisher : rclpy.publisher.Publisher
     convert : callable
-        (Serialized message, what the middleware says of it) -> serialized message, or None to publish nothing.
+        (Serialized message, message information of the middleware) -> serialized message, or None for no publication.
 
     """
     executor = SingleThreadedExecutor(context=node.context)
@@ -105,7 +105,7 @@ def _drain(context, source, publisher, convert):
             while context.ok():
                 try:
                     _drain_one(context, source, wait_set, guard, publish, convert)
-                except InvalidHandle:   # another subscription has just taken its place
+                except InvalidHandle:   # another subscription has just replaced it
                     continue
     finally:
         guard.destroy()

@@ -1,4 +1,4 @@
-"""An arm in the place of a table for a node: its description from a file or from robot_description, the IMU's link, how its root stands."""
+"""An arm in place of a table for a node: its description from a file or robot_description, the IMU's link, the attitude of its root."""
 
 import time
 from collections.abc import Callable
@@ -23,11 +23,11 @@ from imu_calibration.settings import setting
 from msg_adapters.stamps import clean_name
 
 TOPIC = 'topic'
-"""Value of `urdf_file` that stands for the topic robot_description."""
+"""Value of `urdf_file` that selects the topic robot_description."""
 NO_TABLE = ('', 'none')
 """Values of `table_file` that mean: none. Launch arguments cannot be empty."""
 STEP, PATIENCE = 0.1, 5.0
-"""Seconds of one wait; after which it is said what is waited for, and again each time."""
+"""Seconds of one wait; after each the awaited message is logged."""
 Found = TypeVar('Found')
 
 
@@ -56,7 +56,7 @@ def chain_of(node: Node, robot: RobotSettings, table_file: str, *, frame_id: str
     """
     Return the chain of joints that a node's parameters describe, None for neither table nor arm.
 
-    Waits for the topics that must say it, as long as the node runs: they come when somebody else has been started.
+    Waits for the required topics while the node runs: their publishers may be started later.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def chain_of(node: Node, robot: RobotSettings, table_file: str, *, frame_id: str
     robot : RobotSettings
     table_file : str
     frame_id : str
-        Frame of the IMU's messages; '': that of the first one that comes.
+        Frame of the IMU's messages; '': that of the first one received.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def chain_of(node: Node, robot: RobotSettings, table_file: str, *, frame_id: str
 
 
 def words_of(robot: RobotSettings, table_file: str) -> str:
-    """Return what `chain_of` gives, in words."""
+    """Return a description of the result of `chain_of`."""
     if not robot.urdf_file:
         return f'the table {files.user_path(table_file)}'
     return 'the arm of the topic robot_description' if robot.urdf_file == TOPIC else f'the arm {files.user_path(robot.urdf_file)}'
@@ -121,7 +121,7 @@ def _message(node: Node, kind: type, topic: str, qos: QoSProfile, usable: Callab
 
 
 def _waited_for(node: Node, look: Callable[[], Found | None], what: Callable[[], str]) -> Found:
-    """Return what `look` gives once it gives anything; raises an ExternalShutdownException when the context ends before."""
+    """Return the first result of `look` that is not None; raises an ExternalShutdownException when the context ends before."""
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     said = time.monotonic() - PATIENCE + 1.0

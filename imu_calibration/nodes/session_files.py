@@ -1,4 +1,4 @@
-"""Where a live session is kept: the calibration, and beside it the accumulator with which it can go on."""
+"""Files of a live session: the calibration, and the accumulator from which the session can be resumed."""
 
 import os
 import time
@@ -14,12 +14,12 @@ DEFAULT = 'calibration.yaml'
 
 class SessionFiles:
     """
-    The two files of a session; each is written whole or stays as it was, whatever happens to the other.
+    The two files of a session; each is written atomically, independently of the other.
 
     Parameters
     ----------
     save_file : str
-        Path of the calibration; '': `DEFAULT` in the working directory, and nothing is kept unasked.
+        Path of the calibration; '': `DEFAULT` in the working directory, and files are saved on request only.
 
     """
 
@@ -36,7 +36,7 @@ class SessionFiles:
         return self.calibration.with_name(self.calibration.stem + '.accumulator.npz')
 
     def try_place(self) -> str:
-        """Return why nothing can be saved here, '' when it can."""
+        """Return the reason why saving is impossible here, '' when it is possible."""
         try:
             for path in (self.calibration, self.accumulator):
                 files.try_place(path)
@@ -58,7 +58,7 @@ class SessionFiles:
 
     def put_aside(self) -> Path:
         """
-        Give the accumulator of an earlier session another name, so that nothing is written over it; return that.
+        Rename the accumulator of an earlier session, so that it is not overwritten; return the new name.
 
         Raises
         ------
@@ -73,18 +73,18 @@ class SessionFiles:
         return max(live.n_windows - self.n_saved, 0)
 
     def note_saved(self, n_windows: int) -> None:
-        """Take note that so many windows or poses are safe now."""
+        """Record the number of saved windows or poses."""
         self.saved_at, self.n_saved = time.monotonic(), n_windows
 
     def save(self, live: LiveSession, text: str | None) -> tuple[bool, str]:
         """
-        Save both files; return whether both are safe now, and what became of each.
+        Save both files; return whether both are saved, and the outcome for each.
 
         Parameters
         ----------
         live : LiveSession
         text : str or None
-            The calibration; None: there is none, the accumulator is saved alone.
+            The calibration; None: only the accumulator is saved.
 
         """
         wanted: list[tuple[Path, Callable[[], bytes]]] = [] if text is None else [(self.calibration, text.encode)]
@@ -111,7 +111,7 @@ class SessionFiles:
         return True
 
     def keep(self, live: LiveSession, noun: str) -> str:
-        """Keep what is in no file at the end of a session where a place was given; return what became of it, '' when nothing was left."""
+        """Save unsaved data at the end of a session where a path was given; return the outcome, '' when all was saved."""
         unsaved = self.unsaved(live)
         if not unsaved:
             return ''
@@ -120,6 +120,6 @@ class SessionFiles:
             return f"{ends} and are lost: call ~/save, or give parameter 'save_file' and they are kept"
         try:
             files.write_whole(self.accumulator, live.saved(pending=True))
-        except Exception as error:   # the process ends now, whatever happens
+        except Exception as error:   # the process ends in any case
             return f'{ends} and are lost: {shortened(str(error), 300)}'
         return f'{ends}: they are kept in {self.accumulator}; resume:=true continues with them'

@@ -1,4 +1,4 @@
-"""What calibration_node compares the sensor with, a table or gravity alone: decided here, once."""
+"""Reference of calibration_node, a table or only gravity: selected here, once."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,18 +14,18 @@ from imu_calibration.reference.table import Table
 
 @dataclass(frozen=True)
 class SessionReference:
-    """Where the IMU truly was, as a node needs to know it."""
+    """Reference of the IMU's motion, as a node uses it."""
 
     joint_names: JointNames | None
     """Joints to listen to; None: none."""
     text: str
-    """What a session is calibrated on and how, for people."""
+    """Readable description of the reference and the procedure."""
     begin: Callable[[CalibrationOptions, LiveSettings, LiveByHandSettings, bytes | None], LiveSession]
-    """Returns a new session, which goes on with what an earlier one saved, if anything."""
+    """Returns a new session, resumed from an earlier one's accumulator if given."""
 
 
 def reference_of(table: Table | None, named: str) -> SessionReference:
-    """Return the reference that a table or an arm with this name is; None: gravity alone."""
+    """Return the reference for a table or an arm with this name; None: only gravity."""
     if table is None:
         return SessionReference(None, "by hand, since neither 'table_file' nor 'urdf_file' was given: "
                                 "hold the IMU still in 12 different attitudes and turn it in between",

@@ -49,7 +49,7 @@ from msg_adapters.joint_trajectory import trajectory_from_message
 
 STRETCH = 0.1
 """Seconds of simulated time that are computed together, times the time factor; as playback makes some such stretches ahead, a
-trajectory takes effect about half a second later."""
+trajectory is effective about half a second later."""
 
 
 @dataclass(frozen=True)
@@ -93,11 +93,11 @@ class SimulatorSettings:
 
 
 NO_PROFILE = ('', 'none')
-"""Values of `profile` that leave the table at rest."""
+"""Values of `profile` with the table at rest."""
 
 
 class SimulatorNode(Node):
-    """Publishes what a LiveSimulation makes."""
+    """Publishes the messages of a LiveSimulation."""
 
     def __init__(self) -> None:
         super().__init__('simulator_node')
@@ -130,7 +130,7 @@ class SimulatorNode(Node):
                                f'{settings.time_factor:g} times as fast as real time')
 
     def close(self) -> str:
-        """Stop publishing; return what became of it."""
+        """Stop publishing; return the outcome."""
         self._playback.end()
         return '' if self._is_over else f'stopped after {self._playback.n_published} messages'
 
@@ -172,7 +172,7 @@ class SimulatorNode(Node):
         self._truth.publish(String(data=calibration_to_text(truth)))
 
     def _batches(self):
-        """Yield Batch after Batch, a trajectory that came taking over between two of them."""
+        """Yield Batch after Batch; a received trajectory starts between two of them."""
         until, step = 0.0, STRETCH * max(self.settings.time_factor, 1.0)
         while until < self._motion.end or not self.settings.stop_at_end:
             while not self._trajectories.empty():

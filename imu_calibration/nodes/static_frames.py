@@ -1,4 +1,4 @@
-"""/tf_static, for those who need to know where the IMU sits in another frame."""
+"""/tf_static, for the pose of the IMU in another frame."""
 
 from collections.abc import Callable
 from typing import Any
@@ -23,7 +23,7 @@ class StaticFrames:
     ----------
     node : Node
     changed : callable
-        Called after transforms came.
+        Called after the reception of transforms.
 
     """
 
@@ -37,12 +37,12 @@ class StaticFrames:
         return self.transforms.pose(target, source)
 
     def waits_for(self, target: str, source: str) -> str:
-        """Return what is waited for, for people."""
+        """Return a readable description of the awaited transform."""
         return f"the transform from '{target}' to '{source}' on {TOPIC}: {self.transforms.why_not(target, source)}" + \
             (f'; {self.n_unusable} received transforms are unusable (not finite)' if self.n_unusable else '')
 
     def take(self, message: Any) -> None:
-        """Take a tf2_msgs/TFMessage."""
+        """Process a tf2_msgs/TFMessage."""
         for stamped in message.transforms:
             place, turn = stamped.transform.translation, stamped.transform.rotation
             usable = self.transforms.add(*(clean_name(name).lstrip('/') for name in (stamped.header.frame_id, stamped.child_frame_id)),

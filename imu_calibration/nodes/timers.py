@@ -1,4 +1,4 @@
-"""Timers of nodes that go on while simulated time stands still."""
+"""Timers of nodes that continue while simulated time is paused."""
 
 from collections.abc import Callable
 from typing import Any

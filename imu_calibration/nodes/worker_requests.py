@@ -1,4 +1,4 @@
-"""What the thread behind calibration_node is asked, and who hears of what it makes."""
+"""Requests to the thread of calibration_node, and receivers of its results."""
 
 import threading
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from imu_calibration.segmentation.window import Window
 
 @dataclass(frozen=True)
 class Listeners:
-    """Who hears of what the worker makes."""
+    """Receivers of the worker's results."""
 
     calibration: Callable[[str], None]
     """Called with the text of each new calibration document."""
@@ -24,13 +24,13 @@ class Listeners:
 
 
 class Request:
-    """Something asked of the worker."""
+    """A request to the worker."""
 
     def __init__(self, action: Callable[[], tuple[bool, str]]):
         self.action, self.done = action, threading.Event()
         self.success, self.message = False, ''
 
     def answer(self, success: bool, message: str) -> None:
-        """Give the answer."""
+        """Set the result."""
         self.success, self.message = success, message
         self.done.set()
