@@ -1,9 +1,8 @@
 """
 Noise that is not the same at every rest.
 
-Stretches at rest lie in other attitudes, on other things, next to other machines, and their noise differs by some per cent, beside a hand
-by half. A recording of a hundred stretches then knows the noise of the sensor no better than a hundred draws of it allow, however many
-samples each has.
+Intervals at rest differ in attitude, support and nearby machines. Their noise differs by some per cent, near a hand by half. The
+precision of the sensor's noise is then limited by the number of intervals, however many samples each has.
 """
 
 from dataclasses import dataclass, field
@@ -21,22 +20,22 @@ class Parts:
     """Second differences that each is the mean of, shape (n_parts, n_scales)."""
 
     def share(self) -> np.ndarray:
-        """Return the variance of the mean of all parts over that of a part, if they differ in nothing but level, shape (n_scales,)."""
+        """Return the variance of the mean of all parts over that of a part, if only their levels differ, shape (n_scales,)."""
         return (self.terms**2).sum(axis=0) / self.terms.sum(axis=0)**2
 
     def scatter(self, used: np.ndarray, chance: np.ndarray) -> float:
         """
-        Return the standard deviation between parts of the level of the variances, over the level, beyond what chance makes.
+        Return the standard deviation between parts of the level of the variances, over the level, in excess of sampling error.
 
         The moment estimate of DerSimonian and Laird (Controlled Clinical Trials 7:177, 1986) with the numbers of terms for weights,
-        averaged over the averaging times as precisely as each knows it.
+        averaged over the averaging times, weighted by precision.
 
         Parameters
         ----------
         used : ndarray of bool, shape (n_scales,)
             Which averaging times count.
         chance : ndarray, shape (n_used,)
-            Variance of the mean of all parts by chance over the square of its expectation.
+            Sampling variance of the mean of all parts over the square of its expectation.
 
         """
         if len(self.terms) < 2:

@@ -1,10 +1,10 @@
 """
-The slow part of identified noise as sums of first-order Gauss-Markov processes: what estimators can carry as states.
+The slow part of identified noise as sums of first-order Gauss-Markov processes, which estimators can include as states.
 
 A random walk of density K is one that does not forget within the session, ``sd^2 = K^2 time / 2``; flicker of instability B is one in
 every ratio r of times, ``sd^2 = B^2 ln(r) / pi``, since ``integral 2 sd^2 time / (1 + (w time)^2) d ln(time) / ln(r) = B^2 / w``.
 
-The bias of a calibration is then that of the hours around the session, and its standard deviation says how far it moves in them.
+The bias of a calibration is then the mean of the hours around the session; its standard deviation is the variation within them.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ TIMES = RATIO ** np.arange(1, 8)
 
 def bias_processes(figures: NoiseFigures) -> dict[str, tuple[BiasProcess, ...]]:
     """
-    Return sensor -> how its bias moves, the mean of the axes' variances; nothing for a sensor that shows no slow noise.
+    Return sensor -> its bias processes, from the mean of the axes' variances; empty for a sensor without slow noise.
 
     Figures that are held do not enter: a bound is no measurement.
     """

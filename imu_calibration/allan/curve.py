@@ -1,4 +1,4 @@
-"""The second reading: the Allan variances of what is at rest, trends taken out, at constant memory."""
+"""The second pass: the Allan variances of the parts at rest, without trends, at constant memory."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ class AllanCurve:
 
 @dataclass(frozen=True, eq=False)
 class Detrending:
-    """What is subtracted from the samples."""
+    """Subtracted from the samples."""
 
     trends: tuple[tuple[AxisTrend, ...], ...]
     """Trends of each of the six axes."""
@@ -64,10 +64,10 @@ class Detrending:
 
 
 class Sink(Protocol):
-    """Takes the samples of the parts at rest, on the grid of their period."""
+    """Accumulates the samples of the parts at rest, on the grid of their period."""
 
     def push(self, values: np.ndarray, present: np.ndarray) -> None:
-        """Take the next samples of a part, shape (n, 6), and which of them are present."""
+        """Add the next samples of a part, shape (n, 6), and the mask of those present."""
 
     def end_stretch(self) -> None:
         """Close the part."""
@@ -118,7 +118,7 @@ class _PartReader:
         self._grid, self._open = SampleGrid(period), None
 
     def push(self, epoch, imu, parts, time_of):
-        """Take accepted samples of an epoch."""
+        """Add accepted samples of an epoch."""
         if not len(imu):
             return
         begin, end = int(imu.stamp_ns[0]), int(imu.stamp_ns[-1])

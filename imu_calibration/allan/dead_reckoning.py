@@ -1,8 +1,8 @@
 """
-What the noise becomes in metres: the error of dead reckoning from a bias that was taken at rest.
+The position error of dead reckoning, m, with a bias estimated at rest.
 
 The position after t seconds is a weighted sum of the readings, ``(t - s)`` for specific force and ``g (t - s)^2 / 2`` for rates (a tilt
-lets gravity in); the bias is the mean over the time before. All weights together add up to zero, so that flicker and random walks have
+lets gravity in); the bias is the mean over the time before. The weights sum to zero, so that flicker and random walks have
 a variance too.
 """
 
@@ -48,7 +48,7 @@ def position_sd(processes: Sequence[NoiseProcess], coefficients: Sequence[float]
     seconds : float
         Length of the run.
     alignment : float
-        Time at rest before it, over whose mean the bias is taken, s.
+        Time at rest before it, over which the bias is averaged, s.
     gravity : float
         m/s^2.
 

@@ -18,7 +18,7 @@ PER_OCTAVE = 2
 
 def averaging_factors(n_samples: int, per_octave: int = PER_OCTAVE) -> np.ndarray:
     """
-    Return the numbers of samples per mean at which the variance of `n_samples` is taken, integers in rising order.
+    Return the numbers of samples per mean at which the variance of `n_samples` is computed, integers in rising order.
 
     Spaced evenly in the logarithm, up to half of the samples. Beyond `FULL` they are multiples of a power of two, as the halved
     rates need.
@@ -32,13 +32,13 @@ def averaging_factors(n_samples: int, per_octave: int = PER_OCTAVE) -> np.ndarra
 
 
 def octaves_beyond(factor: np.ndarray) -> np.ndarray:
-    """Return by how many halvings of the rate a factor comes below `FULL`, integers."""
+    """Return the number of halvings of the rate that reduce a factor below `FULL`, integers."""
     return np.maximum(np.ceil(np.log2(np.maximum(factor, 1) / FULL) - 1e-9), 0).astype(np.int64)
 
 
 class AllanSums:
     """
-    Sums of squared second differences, taken block by block over stretches without a break.
+    Sums of squared second differences, added block by block over stretches without a break.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class AllanSums:
 
     def push(self, values: np.ndarray, present: np.ndarray | None = None) -> None:
         """
-        Take the next samples of the stretch.
+        Add the next samples of the stretch.
 
         Parameters
         ----------
@@ -94,7 +94,7 @@ class AllanSums:
             level.push(rows, counts, 2.0**k, self.squares, self.terms)
 
     def end_stretch(self) -> None:
-        """Close the stretch; what comes next has no connection with it."""
+        """Close the stretch; the next one is independent of it."""
         if self._length:
             self.lengths.append(self._length)
             self._until.append((self.squares.copy(), self.terms.copy()))
@@ -173,7 +173,7 @@ class _Level:
         return m * (means[0] - means[1])
 
     def _shorten(self):
-        """Keep what later differences need, counted from the first sample kept; forget holes that lie behind."""
+        """Keep what later differences need, counted from the first sample kept; drop earlier holes."""
         if self.sums.shape[1] <= self.reach + 1:
             return
         self.sums = self.sums[:, -self.reach - 1:]

@@ -86,7 +86,7 @@ def _trends(sensor, axes):
 
 
 def _for_filters(figures, sensor, horizon):
-    """Return what most filters ask for, continuous and at the rate of the recording."""
+    """Return the parameters of most filters, continuous and at the rate of the recording."""
     found = figures.densities(sensor, horizon)
     return {'white_noise': found.white, 'random_walk': _finite(found.walk), 'random_walk_is': found.basis,
             'sample_sd': found.sample_sd(figures.rate), 'bias_step_sd': _finite(found.step_sd(figures.rate))}

@@ -1,4 +1,4 @@
-"""The figures of the noise of an IMU as people and programs exchange them, and what filters take from them."""
+"""The noise figures of an IMU, and the parameters of filters from them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,13 +9,13 @@ from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, 
 from imu_calibration.allan.terms import TIME, Term
 
 HORIZON = 100.0
-"""s; a filter that knows white noise and a random walk only is given the walk that has the same Allan variance there."""
+"""s; for a filter with white noise and a random walk only: the walk has the same Allan variance at this averaging time."""
 SLOW = (FLICKER.name, RANDOM_WALK.name, 'gauss_markov')
 
 
 @dataclass(frozen=True)
 class TrendFigure:
-    """A trend that was taken out of an axis before its noise was read."""
+    """A trend that was subtracted from an axis before its noise was estimated."""
 
     name: str
     """'temperature', 'turn_on' or 'ramp'."""
@@ -38,9 +38,9 @@ class AxisFigures:
     others: tuple[tuple[str, ...], ...] = ()
     """Forms that explain the curve as well."""
     alternatives: dict[str, Term] = field(default_factory=dict)
-    """Figures of processes that only those have."""
+    """Figures of processes that occur only in these forms."""
     trends: tuple[TrendFigure, ...] = ()
-    """What was taken out."""
+    """Subtracted trends."""
     record_for: dict[str, float | None] = field(default_factory=dict)
     """Name of a figure that is not determined -> seconds of rest that would do, None: more than two days of it."""
     sample_sd: float = 0.0
@@ -48,7 +48,7 @@ class AxisFigures:
     shortest: float = 0.0
     """Shortest averaging time that was fitted, s; longer than the period where the sensor filters its noise."""
     excess: float = 1.0
-    """Factor on all variances of the fit because the curve departs from the model by more than chance."""
+    """Factor on all variances of the fit because the misfit exceeds the sampling error."""
     oscillation: tuple[float, float] | None = None
     """Frequency (Hz) and amplitude of a line of the periodogram at the hump of a curve that no model explains."""
     scatter: float = 0.0
@@ -84,9 +84,9 @@ class AxisFigures:
 
     def walk(self, horizon: float = HORIZON) -> tuple[float, str]:
         """
-        Return the density of the random walk that stands for the slow part, and where it comes from.
+        Return the density of the random walk that replaces the slow part, and its basis.
 
-        The walk whose Allan variance at the horizon is that of all slow processes together; without a slow part in the curve, the
+        The walk with the total Allan variance of the slow processes at the horizon; without a slow part in the curve, the
         largest walk that the curve allows.
         """
         slow = [(process, coefficient) for process, coefficient in self.processes() if process.name in SLOW]
@@ -110,7 +110,7 @@ class NoiseFigures:
     frame_id: str = ''
     """Frame of the messages."""
     recording: dict = field(default_factory=dict)
-    """Seconds at rest, parts, what was left out."""
+    """Seconds at rest, parts, excluded parts."""
     tau: tuple[float, ...] = ()
     """Averaging times of the Allan deviations, s."""
     provenance: dict = field(default_factory=dict)
@@ -121,7 +121,7 @@ class NoiseFigures:
         return {'accelerometer': self.accelerometer, 'gyroscope': self.gyroscope}[name]
 
     def densities(self, sensor: str, horizon: float = HORIZON, worst: Callable = max) -> 'Densities':
-        """Return the two numbers that most filters take for a sensor: those of its worst axis that the curve says anything of."""
+        """Return the two noise parameters of most filters for a sensor: its worst axis with a finite figure."""
         walks = [axis.walk(horizon) for axis in self.sensor(sensor)]
         walk, basis = worst([found for found in walks if np.isfinite(found[0])] or walks)
         return Densities(float(worst(axis.white for axis in self.sensor(sensor))), float(walk), basis)
@@ -136,7 +136,7 @@ class Densities:
     walk: float
     """Per second and root hertz."""
     basis: str
-    """'walk' (found), 'equivalent' (stands for other slow noise) or 'bound' (none was seen: at most so much)."""
+    """'walk' (found), 'equivalent' (replaces other slow noise) or 'bound' (none was seen: at most so much)."""
 
     def sample_sd(self, rate: float) -> float:
         """Return the standard deviation of the white noise of a sample at a rate (Hz)."""

@@ -1,8 +1,8 @@
 """
-Which processes an Allan curve shows: the forms that the slow part of the noise can take, compared by how well they explain the curve.
+Selection of the processes in an Allan curve: candidate forms of the slow part of the noise, compared by penalised likelihood.
 
 Every form has white noise. Forms are compared by the likelihood of the logarithms of the variances (nearly Gaussian, with the covariance of
-the fitted form) and a price for each parameter; those that come close to the best are possible as well, and are said to be.
+the fitted form) and a price for each parameter; forms close to the best are possible as well, and are reported.
 """
 
 from dataclasses import dataclass, replace
@@ -24,13 +24,13 @@ CLOSE = 6.0
 PRICE, PRICE_OF_TIME = 2.0, 7.0
 """Cost of a coefficient, and of a correlation time, for which many are tried."""
 TIME_STEP = 8
-"""Every so many of the correlation times is asked whether it is plainly likelier than the one that fits itself."""
+"""Stride over the correlation times; each is tested for a clearly higher likelihood than the time of best fit."""
 LEAST_WEIGHT = 0.05
-"""Forms less likely than this, against the best, take no part in intervals."""
+"""Forms less likely than this, against the best, are excluded from intervals."""
 INDEPENDENT = 6.0
 """Forms are compared at averaging times of which the longest part holds so many: with fewer, logarithms are far from Gaussian."""
 CLEAR = 1e-3
-"""Probability below which quantisation is taken in."""
+"""Probability below which quantisation is included."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,16 +52,16 @@ class Choice:
     fits: tuple[FormFit, ...]
     """All forms in order of their cost."""
     moments: Moments
-    """What was fitted."""
+    """Data of the fit."""
 
     @property
     def best(self) -> FormFit:
-        """The form that is taken."""
+        """The selected form."""
         return self.fits[0]
 
     @property
     def rivals(self) -> tuple[FormFit, ...]:
-        """Other forms that explain the curve nearly as well; not those that only add to a form named before."""
+        """Other forms that explain the curve nearly as well, except supersets of a form named before."""
         found: list[FormFit] = []
         for fit in self.fits:
             if fit.cost - self.best.cost <= CLOSE and not any(_is_part(known.form, fit.form) for known in (self.best, *found)):
@@ -69,7 +69,7 @@ class Choice:
         return tuple(found)
 
     def having(self, name: str) -> tuple[list[MomentFit], list[float]]:
-        """Return the fits with a process, the best first, and how likely each is against it; without those that do not count."""
+        """Return the fits with a process, the best first, and the likelihood of each relative to it; negligible ones are omitted."""
         found = [fit for fit in self.fits if name in fit.fit.names]
         weights = [1.0, *(float(np.exp(-0.5 * (fit.cost - found[0].cost))) for fit in found[1:])]
         return [fit.fit for fit, weight in zip(found, weights) if weight > LEAST_WEIGHT], [w for w in weights if w > LEAST_WEIGHT]
@@ -93,7 +93,7 @@ def _is_part(form, wider):
 
 
 def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
-    """Fit every form, with quantisation where the curve shows it; `excess`: factor on all covariances of a curve that nothing explains."""
+    """Fit every form, with quantisation where the curve shows it; `excess`: factor on all covariances of an unexplained curve."""
     fits = _all_forms(moments, (), excess)
     wider = fit_form(moments, fits[0].form, (QUANTISATION.name,))
     if score_at_zero(moments, wider.fit, 0) < CLEAR:
@@ -108,7 +108,7 @@ def _all_forms(moments, fast, excess):
 
 
 def fit_form(moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), *, excess: float = 1.0) -> FormFit:
-    """Fit white noise, `fast` processes and the slow ones of a form; squares larger than chance by `excess` count by so much less."""
+    """Fit white noise, `fast` processes and the slow ones of a form; squares are divided by `excess`."""
     names = (*fast, WHITE.name, *form)
     fit = fit_names(moments, names)
     fit = _likeliest(moments, fit) if GAUSS_MARKOV in form else fit
@@ -130,7 +130,7 @@ def _likeliest(moments, fit):
 
 
 def fit_names(moments: Moments, names: tuple[str, ...]) -> MomentFit:
-    """Fit the processes of these names; a Gauss-Markov process comes last."""
+    """Fit the processes of these names; a Gauss-Markov process is the last."""
     processes = tuple(PROCESSES[name] for name in names if name != GAUSS_MARKOV)
     return fit_with_time(moments, processes) if GAUSS_MARKOV in names else fit_processes(moments, processes)
 

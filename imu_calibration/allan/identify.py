@@ -1,4 +1,4 @@
-"""From a recording at rest to the figures of its noise: what a user calls."""
+"""Identification of the noise figures from a recording at rest: the public functions."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -23,21 +23,21 @@ from imu_calibration.errors import InputError
 from imu_calibration.samples import NominalScaling, SampleBlock
 
 LEAST_SAMPLES = 1000
-"""Samples at rest without which there is no curve to speak of."""
+"""Least number of samples at rest for a curve."""
 EPOCH_GAP = 1.0
 """Time between two epochs of the clock, s; the true one is unknown."""
 
 
 @dataclass(frozen=True, eq=False)
 class RestingRecord:
-    """The Allan curves of what a recording holds at rest, and what was left out and taken out."""
+    """The Allan curves of the parts at rest of a recording, the excluded parts and the subtracted trends."""
 
     curve: AllanCurve
     """Allan variances of the six axes."""
     moments: tuple[Moments, ...]
     """Variances with their covariance, one for each axis: force x, y, z, then rate x, y, z."""
     trends: tuple[tuple[AxisTrend, ...], ...]
-    """What was taken out of each axis."""
+    """Trends subtracted from each axis."""
     parts: tuple[StillPart, ...]
     """Stretches at rest."""
     left_out: LeftOut
@@ -52,10 +52,10 @@ class RestingRecord:
 
 @dataclass(frozen=True, eq=False)
 class NoiseIdentification:
-    """What a recording says about the noise of an IMU."""
+    """The noise of an IMU, estimated from a recording."""
 
     record: RestingRecord
-    """What was read."""
+    """The recording."""
     axes: tuple[AxisNoise, ...]
     """Force x, y, z, then rate x, y, z."""
 
@@ -74,7 +74,7 @@ def identify_noise(source: Callable[[], Iterable[SampleBlock]], nominal: Nominal
     Raises
     ------
     InputError
-        When nothing rests for long enough, or the recording is not usable.
+        When no part at rest is long enough, or the recording is not usable.
 
     """
     record = read_rest(source, nominal)
@@ -89,7 +89,7 @@ def identify_noise(source: Callable[[], Iterable[SampleBlock]], nominal: Nominal
 
 
 def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScaling | None = None) -> RestingRecord:
-    """Read a recording twice, first for what rests and for trends, then for the Allan curves; arguments as for `identify_noise`."""
+    """Read a recording twice, first for parts at rest and trends, then for the Allan curves; arguments as for `identify_noise`."""
     found = survey(source(), nominal)
     pieces = [still_parts(chunks, found.period) for chunks in found.epochs]
     parts, left_out = [part for part, _ in pieces], _joined([left for _, left in pieces])
@@ -112,7 +112,7 @@ def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScali
 
 
 def _require_scatter(curve):
-    """Refuse an axis that says the same all the time: its steps hide the noise."""
+    """Refuse an axis with constant readings: its quantisation hides the noise."""
     names = [f'{sensor} {letter}' for sensor in SENSORS for letter in AXES]
     frozen = [name for name, variance in zip(names, curve.variance.T) if np.sum(variance > 0) < LEAST_SCALES]
     if frozen:
@@ -121,7 +121,7 @@ def _require_scatter(curve):
 
 
 def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:
-    """Return what is written to noise.yaml: the figures of all axes and what was left out."""
+    """Return what is written to noise.yaml: the figures of all axes and the excluded parts."""
     record, left = result.record, result.record.left_out
     times = RecordingTimes(record.curve.period)
     axes = [_axis_figures(record, k, axis, times) for k, axis in enumerate(result.axes)]
@@ -142,7 +142,7 @@ def _axis_figures(record, k, axis, times):
 
 
 def _record_for(axis, times):
-    """Return for how long one must record for each figure that is not determined; what is held counts with the size it may have at most."""
+    """Return the required recording time of each figure that is not determined; a bound counts with its upper limit."""
     found = {}
     for name, term in axis.terms.items():
         asked = name in (WHITE.name, RANDOM_WALK.name, *axis.form)

@@ -20,7 +20,7 @@ from imu_calibration.allan.trends import KeptShare
 STEPS = 25
 """Rounds of weights and coefficients at most."""
 FLOOR = 1e-6
-"""Least share of what the curve allows of a process in the weights, so that they stay finite."""
+"""Least share of the upper limit of each process in the weights, so that they are finite."""
 RIDGE = 0.02
 """Added to the correlations, which are good to a hundredth: neighbouring scales are nearly the same."""
 SHORTEST_TIME = 4.0
@@ -57,13 +57,13 @@ class Moments:
     """The Allan variances of one axis at the scales that are fitted."""
 
     scales: ScaleCovariance
-    """What is expected of them."""
+    """Expected values."""
     variance: np.ndarray
     """Shape (n_scales,)."""
     used: np.ndarray
-    """Which scales take part, bool, shape (n_scales,)."""
+    """Mask of the scales in the fit, bool, shape (n_scales,)."""
     kept: KeptShare = KeptShare()
-    """What is left of each process after trends were taken out."""
+    """Share of each process that remains after subtraction of the trends."""
     parts: Parts = Parts()
     """The variances of each part at rest."""
     scatter: float = 0.0
@@ -97,7 +97,7 @@ class Moments:
         return self.variance[self.used]
 
     def covariance(self, design: np.ndarray, tensor: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the covariance of the variances used for coefficients `values`: by chance, and by a level that differs between parts."""
+        """Return the covariance of the variances used for coefficients `values`: sampling error and variation between parts."""
         chance = np.einsum('p,q,pqij->ij', values, values, tensor)
         if not self.scatter:
             return chance
@@ -120,7 +120,7 @@ def fit_processes(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: 
         Coefficients that the first weights are made with.
 
     """
-    from scipy.optimize import nnls  # here, because it takes long to import
+    from scipy.optimize import nnls  # here, because its import is slow
 
     design, tensor, target = moments.design(processes), moments.tensor(processes), moments.target
     free = np.array([k for k in range(len(processes)) if k not in (fixed or {})], int)
@@ -166,12 +166,12 @@ class Whitener:
         return self._inverse @ scaled
 
     def weights(self, whitened: np.ndarray) -> np.ndarray:
-        """Return the weights of the original vector whose sum is the product with a whitened one."""
+        """Return the weights of the original vector that give the product with a whitened one."""
         return self._inverse.T @ whitened / self._sd
 
 
 def _cholesky(matrix):
-    """Return the factor of a correlation matrix whose smallest eigenvalues may be off by what its approximations cost."""
+    """Return the factor of a correlation matrix with approximation errors in its smallest eigenvalues."""
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
@@ -193,9 +193,9 @@ def _first_guess(design, target, moments):
 
 def fit_with_time(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: dict[int, float] | None = None) -> MomentFit:
     """
-    Fit given processes and, as the last one, a Gauss-Markov process whose correlation time is found along.
+    Fit given processes and, as the last one, a Gauss-Markov process whose correlation time is estimated too.
 
-    For the weights of one model the best time is that of the smallest weighted sum of squares; new weights until the time stays.
+    With fixed weights the best time minimises the weighted sum of squares; the weights are updated until the time converges.
     """
     whitener = Whitener(np.diag((moments.target**2 * moments.scales.tau[moments.used])))
     fit, seen = None, set()

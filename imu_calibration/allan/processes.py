@@ -48,7 +48,7 @@ def mean_covariance(process: NoiseProcess, lag: np.ndarray, seconds: float) -> n
     """
     Return the generalised covariance of means over `seconds` whose beginnings are `lag` s apart.
 
-    For processes without a variance (random walk, flicker) it holds for combinations whose weights add up to zero.
+    For processes without a variance (random walk, flicker) it holds for combinations whose weights sum to zero.
     """
     lag = np.asarray(lag, float)
     return (2 * process.kernel(lag) - process.kernel(lag + seconds) - process.kernel(lag - seconds)) / seconds**2

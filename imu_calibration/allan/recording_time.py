@@ -12,7 +12,7 @@ LENGTHS = 60.0 * np.array([10, 15, 20, 30, 45, 60, 90, 120, 180, 240, 360, 480, 
 RELATIVE_SD = 0.24
 """Standard deviation of a coefficient over the coefficient at which the 95 % interval of its root has a ratio of 1.6."""
 SCALES_FROM = 0.1
-"""s; what a recording says at shorter averaging times is only the white noise, and comes in all lengths."""
+"""s; shorter averaging times determine the white noise only, at any length of recording."""
 
 
 class RecordingTimes:

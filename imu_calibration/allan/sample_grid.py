@@ -1,8 +1,8 @@
 """
-Samples on the grid of their period: how many periods each comes after the one before, however its stamp jitters.
+Samples on the grid of their period: the number of periods between neighbours, robust against jitter of the stamps.
 
-An Allan variance counts samples. A lost one must leave a hole, a late stamp must not: where stamps are nearly regular, the step itself
-tells; where they are not (packets of a bus, stamps of arrival), only what stays late for `WINDOW` samples counts as lost.
+An Allan variance counts samples. A lost one must leave a hole, a late stamp must not: where stamps are nearly regular, a long step is
+a loss; where they are not (packets of a bus, stamps of arrival), only a delay that persists for `WINDOW` samples counts as one.
 """
 
 import numpy as np
@@ -43,7 +43,7 @@ class SampleGrid:
 
 
 def _lost(step):
-    """Return how many samples were lost before each, from lateness that stays."""
+    """Return how many samples were lost before each, from persistent delays."""
     lost = np.zeros(len(step), np.int64)
     windows = len(step) // WINDOW
     if windows < 2:
@@ -57,7 +57,7 @@ def _lost(step):
 
 
 def spread(values: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (values, present) with a row for every period: what is missing is zero and not present."""
+    """Return (values, present) with a row for every period: missing samples are zero and not present."""
     place = np.cumsum(steps) - 1
     if place[-1] == len(values) - 1:
         return values, np.ones(len(values), bool)

@@ -16,7 +16,7 @@ DENSE = np.arange(-36, 37) / 12
 GROWTH, REACH = 1.5, 64.0
 """Further lags grow by this factor, up to this many of the longer averaging time."""
 ROUNDING = 1e-14
-"""Share of the terms of a fourth difference below which it is nothing but what rounding leaves of them."""
+"""Share of the terms of a fourth difference below which it is a rounding error."""
 MOST_LENGTHS = 24
 """Stretches are sorted into this many lengths at most."""
 
@@ -74,7 +74,7 @@ class ScaleCovariance:
         return np.array([[self.product(one, other) for other in processes] for one in processes])
 
     def _sum(self, first, second):
-        """Sum products of correlations over whole lags, both taken as straight between the lags at hand: exact for white noise."""
+        """Sum products of correlations over integer lags, both interpolated linearly between the available lags: exact for white noise."""
         (a, b), (c, d) = ((values[:, :-1], values[:, 1:]) for values in (first, second))
         inside = self._step * (2 * a * c + a * d + b * c + 2 * b * d) / 6
         corners = (b - a) * (d - c) / (6 * np.maximum(self._step, 1.0))
@@ -91,7 +91,7 @@ class ScaleCovariance:
         return total
 
     def _share(self, lag):
-        """Return how many pairs of terms are `lag` apart, over twice the product of the numbers of terms."""
+        """Return the number of pairs of terms at distance `lag`, over twice the product of the numbers of terms."""
         pairs, terms = np.zeros_like(lag), [np.zeros_like(self._short), np.zeros_like(self._long)]
         for length, number in zip(*self._lengths):
             here = [np.maximum(length - 2 * factor + 1, 0.0) for factor in (self._short, self._long)]
@@ -102,7 +102,7 @@ class ScaleCovariance:
     def _correlation(self, process):
         """Return the covariance of second differences at the lags for a unit coefficient, shape (n_pairs, n_lags)."""
         if process not in self._correlations:
-            for known in [other for other in self._correlations if other.time]:   # those of all correlation times are too many to keep
+            for known in [other for other in self._correlations if other.time]:   # too many to keep for all correlation times
                 del self._correlations[known]
             self._correlations[process] = self._evaluate(process, self._lag)
         return self._correlations[process]
@@ -120,7 +120,7 @@ class ScaleCovariance:
 
 def _lags(short, long, length):
     """
-    Return the lags (in samples, whole) at which the correlation of each pair is evaluated, sorted, shape (n_pairs, n_lags).
+    Return the lags (in samples, integers) at which the correlation of each pair is evaluated, sorted, shape (n_pairs, n_lags).
 
     Dense where one difference begins or ends inside the other, and where the number of pairs of terms in the longest stretch bends.
     """
@@ -138,5 +138,5 @@ def _sorted_lengths(lengths):
     lengths = np.sort(np.asarray(lengths, float))
     if len(lengths) <= MOST_LENGTHS:
         return lengths, np.ones(len(lengths))
-    classes = [*np.array_split(lengths[:-1], MOST_LENGTHS - 1), lengths[-1:]]   # the longest alone: only it has terms at the longest scales
+    classes = [*np.array_split(lengths[:-1], MOST_LENGTHS - 1), lengths[-1:]]   # only the longest has terms at the longest scales
     return np.array([part.mean() for part in classes]), np.array([float(len(part)) for part in classes])

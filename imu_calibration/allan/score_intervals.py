@@ -1,9 +1,9 @@
 """
-Intervals by inverting a test: a value belongs to the interval when the curve does not speak against it.
+Intervals by inverting a test: a value belongs to the interval when the curve does not reject it.
 
-For a value that is tried the other parameters are fitted anew, and the weighted misfit in its own direction (efficient score) is compared
+For each trial value the other parameters are refitted, and the weighted misfit in its own direction (efficient score) is compared
 with its scatter *under that value*. The score is a sum of squares of Gaussian numbers and therefore skew, the more so the fewer of the
-longest averages there are; a Pearson III distribution with its first three moments stands for it. So the interval is one-sided where it
+longest averages there are; a Pearson III distribution with its first three moments approximates it. So the interval is one-sided where it
 should be: zero and infinity can belong to it.
 """
 
@@ -38,7 +38,7 @@ def coefficient_interval(moments: Moments, fits: Sequence[MomentFit], weights: S
     name : str
         Name of the process.
     excess : float
-        Factor on all covariances, for a curve that departs from the model by more than chance.
+        Factor on all covariances, for a curve whose misfit exceeds the sampling error.
 
     """
     first, index = fits[0], fits[0].names.index(name)
@@ -54,12 +54,12 @@ def coefficient_interval(moments: Moments, fits: Sequence[MomentFit], weights: S
 
 
 def score_at_zero(moments: Moments, fit: MomentFit, index: int) -> float:
-    """Return the probability of a curve that asks for process `index` as much as this one, when it has none of it."""
+    """Return the p-value of process `index`: the null hypothesis is a coefficient of zero."""
     return _ScoreOfCoefficient(moments, fit, 1.0, index).tail_above(0.0)
 
 
 def time_interval(moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], *, excess: float = 1.0) -> tuple[float, float]:
-    """Return the interval of the time of models whose last process is Gauss-Markov, s; infinite where a random walk does as well."""
+    """Return the interval of the time of models whose last process is Gauss-Markov, s; infinite where a random walk fits as well."""
     times = moments.times
     best = int(np.argmin(np.abs(np.log(times / fits[0].processes[-1].time))))
     scored, tail = _Average([_ScoreOfTime(moments, fit, excess) for fit in fits], weights), TAIL
@@ -105,7 +105,7 @@ class _Score:
         self.moments, self.fit, self._excess, self._tails = moments, fit, excess, {}
 
     def tail_above(self, value):
-        """Return the probability of a larger misfit than what was found, if `value` is true."""
+        """Return the probability of a larger misfit than observed, if `value` is true."""
         return self._evaluate(value)[0]
 
     def tail_below(self, value):
@@ -133,7 +133,7 @@ class _ScoreOfCoefficient(_Score):
         return 1.0 / (np.linalg.norm(_beside(whiten(own), [whiten(other) for other in others])) * self.fit.coefficients[self.index])
 
     def at(self, value):
-        """Return the fit with the coefficient held, its own direction, and those of the others."""
+        """Return the fit with the coefficient fixed, its own direction, and the directions of the other parameters."""
         processes = self.fit.processes
         if processes[-1].time and (value > 0 or self.index != len(processes) - 1):
             fit = fit_with_time(self.moments, processes[:-1], {self.index: value})
@@ -151,7 +151,7 @@ class _ScoreOfCoefficient(_Score):
 
 class _ScoreOfTime(_Score):
     def at(self, value):
-        """Return the fit with the time held, the direction of a longer time, and those of the coefficients."""
+        """Return the fit with the time fixed, the direction of a longer time, and the directions of the coefficients."""
         processes = (*self.fit.processes[:-1], gauss_markov(value))
         fit = fit_processes(self.moments, processes, None, start=self.fit.coefficients)
         design = self.moments.design(processes)
@@ -165,7 +165,7 @@ def _by_time(moments, time, step=0.02):
 
 
 def _tails(moments, fit, direction, others, excess):
-    """Return (probability above, probability below) of the efficient score of `direction` beside `others`."""
+    """Return (probability above, probability below) of the efficient score of `direction` given `others`."""
     covariance = excess * fit.covariance
     whiten = Whitener(covariance)
     own = _beside(whiten(direction), [whiten(other) for other in others])
@@ -177,7 +177,7 @@ def _tails(moments, fit, direction, others, excess):
 
 
 def _beside(own, others):
-    """Return the part of a vector that the others do not explain."""
+    """Return the part of a vector orthogonal to the other directions."""
     if not others:
         return own
     basis = np.linalg.qr(np.column_stack(others))[0]
@@ -188,7 +188,7 @@ def third_moment(weights: np.ndarray, covariance: np.ndarray, expected: np.ndarr
     """
     Return the third central moment of a weighted sum of Allan variances.
 
-    A variance of mean f and variance v from a sum of squares has the third moment 2 v^2 / f (chi-square); mixed ones are taken as
+    A variance of mean f and variance v from a sum of squares has the third moment 2 v^2 / f (chi-square); mixed ones are computed as
     ``2 (v_ij v_jk v_ki)^(2/3) / (f_i f_j f_k)^(1/3)``.
     """
     pair = np.cbrt(np.abs(covariance))**2
@@ -208,7 +208,7 @@ def pearson_tails(score: float, skewness: float) -> tuple[float, float]:
 
 def _crossing(function, start, step):
     """Return where a positive function becomes negative, from `start` on by growing steps of the logarithm."""
-    from scipy.optimize import brentq  # here, because it takes long to import
+    from scipy.optimize import brentq  # here, because its import is slow
 
     if not function(start) > 0:
         return start

@@ -1,8 +1,8 @@
 """
-The parts of a recording in which nothing moved: where its noise can be read.
+The parts of a recording at rest, from which its noise is estimated.
 
-Rest is found coarsely as for the checks (`preflight.rest`), then again against what rest usually looks like in this recording: a chunk that
-scatters more (vibration, a knock) and a step from one mean to the next (somebody moved it) end a part. A bias by itself is slower.
+Rest is found coarsely as for the checks (`preflight.rest`), then again with the typical scatter of this recording at rest: a chunk that
+scatters more (vibration, a knock) and a step from one mean to the next (the IMU was moved) end a part. The drift of a bias is slower.
 """
 
 from dataclasses import dataclass
@@ -53,7 +53,7 @@ class StillPart:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What of a recording was not at rest."""
+    """The parts of a recording that were not at rest."""
 
     motion: float = 0.0
     """Seconds with motion, and around it."""
@@ -65,7 +65,7 @@ class LeftOut:
 
 def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], LeftOut]:
     """
-    Return the parts at rest and what was left out.
+    Return the parts at rest and the excluded parts.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def _at_the_usual_rate(chunks, period):
 
 
 def _usual(chunks, still):
-    """Return the chunks at rest without those that scatter or step beyond what is usual."""
+    """Return the chunks at rest without outliers in scatter or step."""
     if not still.any():
         return still
     scatter = np.log(np.maximum(chunks.sd, _least_scatter(chunks.sd[still])))
@@ -114,7 +114,7 @@ def _usual(chunks, still):
 
 
 def _least_scatter(sd):
-    """Return the scatter of each column below which there is none to speak of: where a coarse converter often says the same, its steps."""
+    """Return the least meaningful scatter of each column: the quantisation steps where a coarse converter often repeats a value."""
     frozen = (sd == 0).mean(axis=0) > FROZEN
     return np.where(frozen, np.maximum(np.quantile(sd, 0.9, axis=0), 1e-300), 1e-300)
 
@@ -153,7 +153,7 @@ def _shrunk(still, margin):
 
 
 def _unbroken_runs(mask, broken):
-    """Return (first, last + 1) of the runs of True, cut where `broken` says that two neighbours are apart."""
+    """Return (first, last + 1) of the runs of True, cut where `broken` separates two neighbours."""
     edges = []
     for first, last in runs_of(mask):
         cuts = first + 1 + np.flatnonzero(broken[first:last - 1])

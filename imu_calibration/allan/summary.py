@@ -1,4 +1,4 @@
-"""The figures of the noise in words and rows: for the terminal and the report."""
+"""The noise figures as sentences and rows: for the terminal and the report."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bia
 BASIS = {'walk': 'as found', 'equivalent': 'equivalent of the slow noise', 'bound': 'none detected: upper limit'}
 NO_BOUND = 'no bound'
 WORTH_SAYING = 0.04
-"""Scatter of the variances between rests that is said: two per cent of the noise."""
+"""Scatter of the variances between rests above which it is reported: two per cent of the noise."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class FigureRow:
     name: str
     """Name in noise.yaml."""
     title: str
-    """What people call it, with its letter."""
+    """Usual name, with its letter."""
     value: str
     """The figure; '<' and the upper end where it is held."""
     interval: str
@@ -109,13 +109,13 @@ def counts(figures: NoiseFigures) -> dict[str, int]:
 
 
 def exit_code(figures: NoiseFigures) -> int:
-    """Return 0 when every figure that counts is determined and nothing was lost, else 3."""
+    """Return 0 when every required figure is determined and no sample was lost, else 3."""
     found = counts(figures)
     return 3 if found[WEAK] or found[HELD] or figures.recording.get('dropped') else 0
 
 
 def lines(figures: NoiseFigures) -> list[str]:
-    """Return what a user must know besides the figures: what was left out and taken out, what else fits, how long to record."""
+    """Return the notes on the figures: excluded parts, subtracted trends, other forms that fit, required recording time."""
     found = [_rest_line(figures.recording)]
     for sensor in SENSORS:
         for letter, axis in zip(AXES, figures.sensor(sensor)):
@@ -128,7 +128,7 @@ def lines(figures: NoiseFigures) -> list[str]:
 
 
 def _metres(figures):
-    """Return what the noise becomes in dead reckoning."""
+    """Return the error of dead reckoning due to the noise."""
     runs = [f'{significant(float(np.hypot(*shares.values())), 2)} m after {duration(seconds)}'
             for seconds, shares in position_budget(figures)]
     return f'error of dead reckoning from rest by noise only: {", ".join(runs)}'
@@ -168,12 +168,12 @@ def _hump(sensor, axis):
 
 
 def said(form: tuple[str, ...]) -> str:
-    """Return a form in words."""
+    """Return a form as text."""
     return ' and '.join(name.replace('_', ' ').replace('gauss markov', 'a Gauss–Markov process') for name in form) or 'white noise alone'
 
 
 def _longest(figures):
-    """Return for how long one must record until everything that counts is determined, or ''."""
+    """Return the recording time that determines all required figures, or ''."""
     needed = [axis.record_for[term.name] for sensor in SENSORS for axis in figures.sensor(sensor) for term in requested(axis)
               if term.name in axis.record_for]
     if not needed:
@@ -183,7 +183,7 @@ def _longest(figures):
 
 
 def filter_lines(figures: NoiseFigures, rates: list[float], horizon: float = HORIZON) -> list[str]:
-    """Return what filters ask for, continuous and at each rate."""
+    """Return the parameters of filters, continuous and at each rate."""
     found = []
     for sensor in SENSORS:
         densities = figures.densities(sensor, horizon)

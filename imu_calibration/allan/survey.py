@@ -1,4 +1,4 @@
-"""The first reading of a recording: short means of the whole of it, the period, the temperature, and what looks wrong."""
+"""The first pass over a recording: short means, the period, the temperature, and faults."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ CAPACITY = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What a recording holds."""
+    """Summary of a recording."""
 
     epochs: list[Chunks]
     """Chunks of each epoch of the clock."""
@@ -28,7 +28,7 @@ class Survey:
     temperature: tuple[np.ndarray, np.ndarray] | None
     """Stamps (ns) and degrees Celsius, thinned; None without."""
     findings: tuple
-    """What looks wrong with the recording."""
+    """Faults of the recording."""
     dropped: Counter = field(default_factory=Counter)
     """Reason -> messages that could not be used."""
     frame_id: str = ''
@@ -63,12 +63,12 @@ def survey(blocks: Iterable[SampleBlock], nominal: NominalScaling | None = None)
 
 
 def _period(epochs):
-    """Return the period of most chunks: the mean of those near the median, since stamps may come in whole milliseconds."""
+    """Return the period of most chunks: the mean of those near the median, since stamps may be rounded to milliseconds."""
     steps = np.concatenate([chunks.duration / chunks.size for chunks in epochs]) if epochs else np.zeros(0)
     if not len(steps):
         return 0.0
     middle = np.median(steps)
-    return float(f'{np.mean(steps[np.abs(steps / middle - 1.0) < 0.02]):.9g}')   # what rounding adds does not belong into a file
+    return float(f'{np.mean(steps[np.abs(steps / middle - 1.0) < 0.02]):.9g}')   # without rounding errors in the file
 
 
 class _Thinned:

@@ -16,11 +16,11 @@ DETERMINED_RATIO = 1.6
 MISFIT = 1e-3
 """Probability of a misfit below which the shortest averaging times are left out."""
 LEAST_SCALES = 8
-"""Averaging times that stay at least."""
+"""Least number of averaging times in the fit."""
 LONGEST_LEFT_OUT = 2.0
 """s; a model that fails beyond is wrong for another reason than a filter in the sensor."""
 WHITE_SHARE = 0.5
-"""Share of the shortest variance that white noise must make for what is shorter to be left out of a curve that nothing explains."""
+"""Least share of white noise in the shortest variance for which shorter averaging times of an unexplained curve are excluded."""
 MARGIN = 8.0
 """Where a filter shows, averaging times up to so many of the longest that shows it are left out."""
 TIME = 'correlation_time'
@@ -53,17 +53,17 @@ class AxisNoise:
     form: tuple[str, ...]
     """Names of the processes that make the slow part; empty: none shows."""
     terms: dict[str, Term]
-    """Name of the process -> its figure; 'correlation_time' beside 'gauss_markov'."""
+    """Name of the process -> its figure; 'correlation_time' in addition to 'gauss_markov'."""
     others: tuple[tuple[str, ...], ...]
     """Other forms that explain the curve as well."""
     alternatives: dict[str, Term]
-    """Figures of processes that only those have."""
+    """Figures of processes that occur only in these forms."""
     fit: MomentFit
     """The fitted model."""
     shortest: float
     """Shortest averaging time that was fitted, s."""
     excess: float
-    """Factor on all covariances because the curve departs from the model by more than chance, at least 1."""
+    """Factor on all covariances because the misfit exceeds the sampling error, at least 1."""
     oscillation: tuple[float, float] | None = None
     """Frequency (Hz) and amplitude: of the sine with the largest hump that no model explains; from a recording, of its line."""
     scatter: float = 0.0
@@ -91,7 +91,7 @@ def identify_axis(moments: Moments) -> AxisNoise:
 
 
 def scatter_of(moments: Moments) -> float:
-    """Return by how much the level of the variances differs from part to part beyond chance, as a model with every slope says of chance."""
+    """Return the excess variation of the level of the variances between parts; the sampling error is that of a model with every slope."""
     fit = fit_names(moments, RICHEST[0])
     expected = moments.design(fit.processes) @ fit.coefficients
     return moments.parts.scatter(moments.used, np.diag(fit.covariance) / expected**2)
@@ -108,7 +108,7 @@ def _hump(moments, fit):
 
 def predicted(moments: Moments, axis: AxisNoise) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return what the model says of every averaging time of a recording: the variance, and the degrees of freedom of a measured one.
+    Return the prediction for every averaging time of a recording: the variance, and the degrees of freedom of a measured one.
 
     The level of the noise differs there from part to part as it did where it was identified.
     """
@@ -122,9 +122,9 @@ def predicted(moments: Moments, axis: AxisNoise) -> tuple[np.ndarray, np.ndarray
 
 def fit_range(moments: Moments) -> tuple[Moments, float]:
     """
-    Return the moments without the averaging times at which the sensor filters its noise, and the misfit that stays.
+    Return the moments without the averaging times at which the sensor filters its noise, and the remaining misfit.
 
-    The shortest ones are left out until one of the richest models explains the rest. Where none ever does (vibration), those are kept that
+    The shortest ones are excluded until one of the richest models explains the others. Where none does (vibration), those are kept that
     are explained best, as long as their shortest still shows white noise, else all.
 
     Returns
@@ -132,7 +132,7 @@ def fit_range(moments: Moments) -> tuple[Moments, float]:
     Moments
         With `used` reduced.
     float
-        Factor by which squares are larger than chance, 1 when they are not.
+        Excess of the squares over their expectation, at least 1.
 
     """
     most = min(int(np.sum(moments.scales.tau <= LONGEST_LEFT_OUT)), int(moments.used.sum()) - LEAST_SCALES)
@@ -150,7 +150,7 @@ def fit_range(moments: Moments) -> tuple[Moments, float]:
 
 
 def _with_margin(moments, count, most):
-    """Return the moments without what a filter still bends unseen, as 1 - 3/2 (its time) / tau does, when it was seen at all."""
+    """Return the moments without the scales at which a detected filter still bends the curve, by 1 - 3/2 (its time) / tau."""
     tau = moments.scales.tau
     return without_finest(moments, min(int(np.sum(tau < MARGIN * tau[count])), most)) if count else moments
 
@@ -181,7 +181,7 @@ def _held(term):
 
 
 def _doubted(terms, best, rivals):
-    """Return the terms with those weak that another form, which explains the curve as well, does without."""
+    """Return the terms; a term is weak when another form without it explains the curve as well."""
     doubted = {}
     for name, term in terms.items():
         without = [rival.form for rival in rivals if name in best.form and name not in rival.form]

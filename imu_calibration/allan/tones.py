@@ -49,8 +49,8 @@ class ToneSearch:
         self._power, self._count, self._samples = np.zeros(self._size // 2 + 1), 0, np.zeros(0)
 
     def push(self, values: np.ndarray, present: np.ndarray) -> None:
-        """Add the next samples of a rest, shape (n, 6); missing ones are replaced by the mean of the others."""
-        from scipy.signal import periodogram  # here, because it takes long to import
+        """Add the next samples of a rest, shape (n, 6); missing ones are replaced by the mean."""
+        from scipy.signal import periodogram  # here, because its import is slow
 
         if not self._size or not present.any():
             return

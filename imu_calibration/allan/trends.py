@@ -1,9 +1,9 @@
 """
-What is not noise in the readings at rest: the temperature, the settling after turn-on, a steady drift.
+Trends in the readings at rest: temperature, settling after turn-on, steady drift.
 
 Each is a regressor on means of short blocks, ``reading = one constant for each part + sum of coefficient * regressor + noise``, with white
 noise and a random walk whose ratio comes from the restricted likelihood. A bias that walks looks like a trend to ordinary least squares;
-against its own covariance it does not. What is found is subtracted; how much noise goes with it at long averaging times is known.
+against its own covariance it does not. Significant trends are subtracted; the noise removed with them at long averaging times is computed.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ MOST_BLOCKS = 200
 CLEAR = {'temperature': 3.3, 'turn_on': 4.0, 'ramp': 4.0}
 """A trend counts from this many standard deviations on: 1 in 1000, also with the shapes of turn-on that are tried."""
 LEAST_BLOCKS = 12
-"""More blocks than constants by this number, or nothing is asked."""
+"""Trends are tested only with this many more blocks than constants."""
 SETTLING_SHARES = (1 / 40, 1 / 20, 1 / 10, 1 / 5)
 """Time constants of turn-on that are tried, as shares of the recording."""
 RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e5, 37)])
@@ -133,7 +133,7 @@ class TrendSearch:
         return self.blocks.temperature_c is not None and np.ptp(self.blocks.temperature_c) > 0.1
 
     def _clearest(self, axis, chosen, names):
-        """Return the (name, time constant) whose coefficient is clearest beside those chosen, or None."""
+        """Return the (name, time constant) of the most significant coefficient given the selected ones, or None."""
         span = np.ptp(self.blocks.time) + self.blocks.seconds
         taken = {name for name, _ in chosen}
         tried = [(name, constant) for name in names if name not in taken
@@ -159,7 +159,7 @@ class TrendSearch:
             basis, triangle = np.linalg.qr(inverse @ (design / size))
             rest = inverse @ target
             along = basis.T @ rest
-            # An axis that stays on one step leaves nothing but rounding.
+            # The residual of an axis with constant readings is a rounding error.
             squares = max(float(rest @ rest - along @ along), np.finfo(float).eps * float(rest @ rest), np.finfo(float).tiny)
             freedom = len(target) - design.shape[1]
             cost = logs + 2 * np.log(np.abs(np.diag(triangle))).sum() + freedom * np.log(squares)
@@ -171,7 +171,7 @@ class TrendSearch:
         return values[-len(trends):], sd[-len(trends):], best
 
     def kept(self, axis: int, trends: tuple[AxisTrend, ...]) -> 'KeptShare':
-        """Return how much of the Allan variance is left when these trends have been taken out."""
+        """Return the share of the Allan variance that remains after subtraction of these trends."""
         if not trends:
             return KeptShare()
         shapes = [(trend.name, trend.time) for trend in trends]
@@ -205,10 +205,10 @@ class TrendSearch:
 
 @dataclass(frozen=True, eq=False)
 class KeptShare:
-    """Share of the Allan variance of a process that is left after trends were taken out."""
+    """Share of the Allan variance of a process that remains after subtraction of trends."""
 
     tau: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """Averaging times, s; empty when nothing was taken out."""
+    """Averaging times, s; empty without trends."""
     shares: dict = field(default_factory=dict)
     """Name of the process -> shares at `tau`."""
 
