@@ -1,4 +1,4 @@
-"""What was gathered as bytes and back: a session that is interrupted goes on where it was saved."""
+"""Save and load a `Gathered` as bytes, so that an interrupted session can be resumed."""
 
 import io
 import json
@@ -32,11 +32,11 @@ def to_bytes(gathered: Gathered, model: SensorModel, demand: Demand = Demand()) 
     Parameters
     ----------
     gathered : Gathered
-        Its least-squares system, the held-out blocks of the proof, poses and counts; windows with samples are left out.
+        Its least-squares system, the held-out blocks of the proof, poses and counts; windows with samples are not saved.
     model : SensorModel
-        The model whose columns it holds.
+        The model of its columns.
     demand : Demand
-        What joined the model that was asked for.
+        Effects added to the requested model.
 
     """
     names = {name: list(getattr(model, name)) for name in (*_MODEL, 'joint_names')}
@@ -99,7 +99,7 @@ def from_bytes(data: bytes, model: SensorModel) -> Gathered:
 
 @contextmanager
 def _reading(data):
-    """Give (header, arrays) of an archive; whatever is damaged becomes one line."""
+    """Return (header, arrays) of an archive; raise a DocumentError when it is damaged."""
     try:
         with load_arrays(data) as arrays:
             header = json.loads(bytes(arrays['header']).decode())
@@ -115,13 +115,13 @@ def _reading(data):
 
 
 def saved_model(data: bytes) -> SensorModel:
-    """Return the SensorModel whose columns a saved accumulator holds; raises as `from_bytes` when it is damaged."""
+    """Return the SensorModel of the columns of a saved accumulator; raises as `from_bytes` when it is damaged."""
     with _reading(data) as (header, _):
         return _model(header)
 
 
 def saved_demand(data: bytes) -> Demand:
-    """Return what joined the model that was asked for before a session was saved; raises as `from_bytes` when it is damaged."""
+    """Return the effects added to the requested model before a session was saved; raises as `from_bytes` when it is damaged."""
     with _reading(data) as (header, _):
         return Demand.from_mapping(header.get('demand', {}), header['point'])
 
@@ -166,7 +166,7 @@ def _fields(header, arrays, label):
     for k, kind in enumerate(header['kinds']):
         statistics = {sensor: SensorStatistics(mean[k], np.zeros((0, mean.shape[1])), variance[k], inflation[k])
                       for sensor, (mean, variance, inflation) in columns.items()}
-        time, duration, *step = map(float, numbers[k])   # files of earlier versions know no steps
+        time, duration, *step = map(float, numbers[k])   # files of earlier versions have no steps
         rows.append(WindowStatistics(kind, time, duration, int(whole[k, 0]), statistics, int(whole[k, 1]), *step))
     within, slow = ({tuple(key): arrays[f'{label}{name}.{number}'] for number, key in enumerate(header[name])}
                     for name in ('within', 'slow'))

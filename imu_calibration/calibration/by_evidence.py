@@ -1,10 +1,10 @@
 """
-One mind for `calibrate` and `diagnose`: what a recording demands is in the model.
+Model selection by `calibrate` and `diagnose` in common: effects that the data support are added to the model.
 
-The recording is calibrated with the model that is asked for, then every effect of the catalogue is asked for as a diagnosis asks. What it
-names joins the model; what a formula beyond the catalogue does without, what parts of the recording deny, or what is no more than chance
-once the standard deviations allow for all that the model misses, does not, and widens the standard deviations instead. So does what would
-do nearly as well as a choice, and what stays unexplained: by how much it may move a bias.
+The recording is calibrated with the requested model, then every effect of the catalogue is tested as in a diagnosis. Significant effects
+are added to the model. An effect is rejected when a formula beyond the catalogue makes it unnecessary, when the estimates from parts of
+the recording differ, or when it is not significant with the widened standard deviations; it then widens the standard deviations instead.
+So do alternatives to a chosen effect that fit nearly as well, and the unexplained residual: by the change of a bias that it may cause.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,47 +37,47 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import FAMILY_WISE
 
 Solved = tuple[Solution, Gathered, SensorModel]
-"""A solution, what it was made of, and the model whose columns that holds."""
+"""A solution, the data that it was solved from, and the model of their columns."""
 
 
 @dataclass(frozen=True, eq=False)
 class EvidentSolution:
-    """A solution with what its recordings demand of the model, and what was found on the way there."""
+    """A solution with the effects that its recordings support, and the result of the search for them."""
 
     solution: Solution
-    """Of the model that was asked for and what is demanded, its covariance widened."""
+    """Solution of the requested model with the added effects, its covariance widened."""
     gathered: Gathered
-    """What was solved."""
+    """The data that were solved."""
     model: SensorModel
-    """The model whose columns were gathered."""
+    """The model of the gathered columns."""
     demand: Demand = Demand()
-    """What every later solution of the same recordings needs to know."""
+    """Result of the search that later solutions of the same recordings need."""
     found: Investigation | None = None
-    """What was asked and answered; None with too few windows."""
+    """Search result; None with too few windows."""
 
 
 @dataclass(frozen=True, eq=False)
 class EvidentResult:
-    """A calibration with what was found on the way to its model."""
+    """A calibration with the result of the search for its model."""
 
     result: TableResult
     """The calibration."""
     found: Investigation | None
-    """What was asked and answered; None with too few windows."""
+    """Search result; None with too few windows."""
 
 
 def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
                           provenance: dict | None = None, progress: Callable | None = None, asking: Callable | None = None,
                           mapper: Callable = map, names: Sequence[str] | None = None) -> EvidentResult:
     """
-    Calibrate from one or several recordings of the same IMU with what they demand on top of the model that is asked for.
+    Calibrate from one or several recordings of the same IMU; effects that they support are added to the requested model.
 
     Parameters
     ----------
     sources, table, options, provenance, progress, mapper, names
         As for `calibrate`.
     asking : callable, optional
-        Called with the share of the search that is done.
+        Called with the completed share of the search.
 
     Raises
     ------
@@ -94,19 +94,19 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
 def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, *, solve_again: Callable[[CalibrationOptions], Solved],
                       asking: Callable | None = None) -> EvidentSolution:
     """
-    Return what recordings demand on top of the model that is asked for, solved.
+    Return the solution of the requested model with the effects that the recordings support.
 
     Parameters
     ----------
     first : tuple
-        (Solution, Gathered with the windows to ask, SensorModel) of the model that is asked for.
+        (Solution, Gathered with the windows of the search, SensorModel) of the requested model.
     table : Table
     options : CalibrationOptions
-        What is asked for.
+        Options of the requested model.
     solve_again : callable
-        Returns the same for other options: `added` effects, taken at their `point`.
+        Returns the same for other options: `added` effects, linearised at their `point`.
     asking : callable, optional
-        Called with the share of the search that is done.
+        Called with the completed share of the search.
 
     """
     solution, gathered, model = first
@@ -122,7 +122,7 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
         added = tuple(question.effect.key for question in beyond)
         solution, gathered, model = solve_again(replace(options, added=added, point=point))
         sure = [question for question in more if not _is_faint(solution, question)]
-        if len(sure) < len(more):   # what may be a rival of what the largest names goes first
+        if len(sure) < len(more):   # possible rivals of the effects found in the largest recording are removed first
             more = sure
             continue
         found = _without_faint(found, solution)
@@ -137,16 +137,16 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
 def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known: Demand,
              asking: Callable | None = None) -> EvidentSolution:
     """
-    Return what windows demand where columns can be taken no more: what the model holds stays in it, what it lacks is said and widens.
+    Return the supported effects when columns cannot be recomputed: missing effects are reported and widen the covariance.
 
     Parameters
     ----------
     solved : tuple
-        As for `solve_by_evidence`, of the model that is asked for with the effects that joined it.
+        As for `solve_by_evidence`, of the requested model with the added effects.
     table, options, asking
         As for `solve_by_evidence`.
     known : Demand
-        What was demanded when the columns were taken.
+        The effects that were supported when the columns were computed.
 
     """
     solution, gathered, model = solved
@@ -156,25 +156,25 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
     found = inquire(parts[0], table, baseline_model(options, table, solution.model), progress=asking,
                     bias_processes=options.bias_processes)
     found = _without_faint(found, solution)
-    lacking = [] if found.limits else _beyond(found.adopted, model)   # a search that met a limit is the solution itself
+    lacking = [] if found.limits else _beyond(found.adopted, model)   # after a limit was found, the solution is that of the search
     changes = replace(_changes([found], known.added), lacking=tuple(question.name for question in lacking))
     demand = Demand(known.added, known.point, changes, (*known.moves, *_moves(found, lacking)), _clipped(found))
     return EvidentSolution(demand.applied(solution), gathered, model, demand, found)
 
 
 def windows_to_ask(gathered: Gathered) -> list[list[Window]]:
-    """Return the windows of each recording that are enough to ask for effects, those of the largest first."""
+    """Return the windows of each recording that suffice for a search of effects, the largest recording first."""
     return [windows for windows in (spread.windows for spread in gathered.spreads) if len(windows) >= LEAST_WINDOWS]
 
 
 def _clipped(found):
-    """Return the solution of a search that found a limit: samples that it spoils are out of its windows, and of no others; else None."""
+    """Return the solution of a search that found a limit, with only the saturated samples removed from its windows; else None."""
     return extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.adopted,
                              saturations=found.limits) if found.limits else None
 
 
 def _changes(searches, added):
-    """Return what searches, the first above all, and what they added do to the model that was asked for."""
+    """Return the changes of the requested model by searches (the first has priority) and by the effects that they added."""
     found, model = searches[0], searches[0].attempt.baseline
     clipping = (model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name for limit in found.limits)
     return ModelChanges((*clipping, *(name for _, name in added)), tuple(question.name for question in found.denied), _strange(searches))
@@ -186,19 +186,19 @@ def _beyond(named, model):
 
 
 def _is_faint(solution, question):
-    """Return whether an effect is in a solution and does not stand out there."""
+    """Return whether an effect is in a solution but not significant."""
     return question.effect.key in solution.model.slices and not stands_out(solution, question)
 
 
 def _without_faint(found, solution):
-    """Return the Investigation without findings that are in a solution and do not stand out there."""
+    """Return the Investigation without findings that are in a solution but not significant."""
     faint = [question for question in found.named if _is_faint(solution, question)]
     return replace(found, named=[question for question in found.named if question not in faint],
                    denied=[*found.denied, *faint]) if faint else found
 
 
 def _named_elsewhere(found, others):
-    """Return what the search names in other recordings only, those of larger ones first."""
+    """Return the effects that the search found in other recordings only, larger recordings first."""
     more = {}
     for question in (question for other in others for question in other.adopted):
         more.setdefault(question.effect.key, question)
@@ -220,25 +220,25 @@ def stands_out(solution: Solution, question: Question) -> bool:
     if not one_significant(far, np.sqrt(np.diag(solution.covariance)[at])):
         return False
     sizes, directions = np.linalg.eigh(solution.covariance[np.ix_(at, at)])
-    known = sizes > SURE * sizes[-1]   # arms of three sensors add up to nothing by convention
+    known = sizes > SURE * sizes[-1]   # the lever arms of three sensors sum to zero by convention
     return bool(chi2_sf(((directions.T @ far)[known]**2 / sizes[known]).sum(), known.sum()) < FAMILY_WISE)
 
 
 def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
-    """Return the options of the model from which effects are asked: what was not asked for has to prove itself."""
+    """Return the options of the baseline model of the search: effects that were not requested have to be significant."""
     return replace(options, accelerometer_model=options.accelerometer_model or BARE, reference_model=options.reference_model or 'none')
 
 
 def baseline_model(options: CalibrationOptions, table: Table, solved: SensorModel) -> SensorModel:
     """
-    Return the model from which effects are asked.
+    Return the baseline model of the search.
 
     Parameters
     ----------
     options : CalibrationOptions
     table : Table
     solved : SensorModel
-        The model of a solution: where its columns were linearised holds for the same effects here.
+        The model of a solution; the same effects are linearised at its point.
 
     """
     model = choose_model(baseline_options(options), table)
@@ -253,13 +253,13 @@ def _strange(found):
 
 
 def _point(found):
-    """Return effect -> values at which its columns are to be taken, of what was found."""
+    """Return effect -> values at which its columns are linearised, of the effects found."""
     model = found.attempt.recording.model
     return {question.name: model.point[question.name] for question in found.adopted if question.name in model.point}
 
 
 def _moves(found, lacking=()):
-    """Return (what other choices may move parameters by, weight): what is denied, doubtful, implausible or lacking, a rest, rivals."""
+    """Return (changes of parameters by other choices of effects, weight): rejected, doubtful, implausible or missing effects, rivals."""
     moves = [(found.attempt.moved_by(found.named, question), 1.0)
              for question in (*found.denied, *found.doubtful, *found.implausible, *lacking)]
     moves += [(moved, 1.0) for moved in biases_off(found.attempt.baseline, found.rests)]

@@ -38,7 +38,7 @@ def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOpt
     Parameters
     ----------
     sources : sequence of callables
-        Each returns an iterator of SampleBlock when called; called again when effects must be linearised anew.
+        Each returns an iterator of SampleBlock when called; called again when effects must be linearised again.
     table : Table
         The reference.
     options : CalibrationOptions
@@ -47,7 +47,7 @@ def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOpt
     progress : callable, optional
         Called with the number of IMU samples read.
     mapper : callable
-        Applies the map step to the recordings; `map`, or that of a pool.
+        Applies the map step to the recordings; `map`, or the `map` of a pool.
     names : sequence of str, optional
         Names of the recordings for messages.
 
@@ -69,10 +69,10 @@ def solve_recordings(sources: Sequence[Callable], table: Table, options: Calibra
                      progress: Callable | None = None, mapper: Callable = map, names: Sequence[str] | None = None,
                      keep_windows: bool = False) -> tuple[Solution, Gathered, SensorModel]:
     """
-    Return (Solution, Gathered, the SensorModel whose columns were gathered) of recordings; arguments as in `calibrate`.
+    Return (Solution, Gathered, SensorModel of the gathered columns) of recordings; arguments as in `calibrate`.
 
     keep_windows : bool
-        Whether windows are kept to ask for effects (`by_evidence`).
+        Whether windows are kept for the search of effects (`by_evidence`).
     """
     names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
     model = choose_model(options, table)
@@ -123,7 +123,7 @@ def _first_temperature(sources):
 
 
 def solve_gathered(gathered: Gathered, model: SensorModel, options: CalibrationOptions = CalibrationOptions()) -> Solution:
-    """Return the Solution of what was gathered with the columns of `model`, with the effects that it asks for: the reduce step."""
+    """Return the Solution of gathered data with the columns of `model` for the requested effects: the reduce step."""
     narrow = settle_model(model, options, gathered)
     accumulator = gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
     solution = solve(accumulator, narrow, bias_processes=options.bias_processes)
@@ -135,14 +135,14 @@ def solve_gathered(gathered: Gathered, model: SensorModel, options: CalibrationO
 
 def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions = CalibrationOptions()) -> Calibration:
     """
-    Return the calibration of what a live session saved (`accumulator_state`), of the model whose columns it gathered, with what joined it.
+    Return the calibration of a saved live session (`accumulator_state`), with the model of its columns and the added effects.
 
     Raises
     ------
     DocumentError
-        When it is damaged, or was gathered on other joints.
+        When it is damaged, or was gathered with different joints.
     NotObservableError
-        When nothing is determined.
+        When no parameter is determined.
 
     """
     model = accumulator_state.saved_model(data)
@@ -160,7 +160,7 @@ def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions 
 def conclude(solution: Solution, gathered: Gathered, model: SensorModel, *, table: Table,
              options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None,
              changes: ModelChanges = ModelChanges()) -> TableResult:
-    """Judge a solution of what was gathered with `model`, say which motions it lacks, and return the TableResult."""
+    """Judge a solution of data gathered with `model`, name the missing motions, and return the TableResult."""
     tolerances = tolerances_of(solution.model, options.tolerances)
     solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
     needed = motions_needed(solution, tolerances, table)

@@ -28,9 +28,9 @@ class CheckResult:
     """The errors of a calibration on a recording."""
 
     proof: dict
-    """Sensor -> error before and after, interval, on how much, by what the IMU does (see `proof.prove`); {}: it cannot be told."""
+    """Sensor -> error before and after, interval and amount of data, by regime (see `proof.prove`); {}: not determined."""
     findings: tuple = ()
-    """What a look at the recording found."""
+    """Findings of the checks of the recording."""
     why: str = 'fewer than three windows of rest or motion were found; record for longer'
     """Why there is no proof, where there is none."""
 
@@ -95,7 +95,7 @@ def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calib
 
 
 def _with_corrected(source, calibration, options):
-    """Yield the blocks of a recording with corrected readings beside the raw ones, as compensation writes them into a bag."""
+    """Yield the blocks of a recording with corrected readings in addition to the raw ones, as compensation writes them into a bag."""
     temperature = None
     if invertible(calibration.model).needs_temperature:
         known = [block.temperature for block in source() if block.temperature is not None]

@@ -20,7 +20,7 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 
 
 class Collector:
-    """Feeds blocks to the window finder and reduces what it finds; the same object serves bags and live topics."""
+    """Feeds blocks to the window finder and reduces its windows; the same object serves bags and live topics."""
 
     def __init__(self, table: Table, model: SensorModel, settings: WindowSettings = WindowSettings(), *,
                  nominal: NominalScaling | None = None, session: int = 0, watchers: Sequence[Watcher] = (), windows: list | None = None,
@@ -30,7 +30,7 @@ class Collector:
         self.gathered = Gathered(judged_from=judged_from)
 
     def push(self, block: SampleBlock) -> list[Window]:
-        """Take a block and return the windows that it completed."""
+        """Process a block and return the windows that it completed."""
         if block.imu is not None and len(block.imu):
             self._note_imu(block.imu)
         if block.temperature is not None and len(block.temperature):
@@ -38,7 +38,7 @@ class Collector:
         return self._take(self.gatherer.push(block))
 
     def finish(self) -> Gathered:
-        """Close the last window and return what was gathered."""
+        """Close the last window and return the gathered data."""
         self._take(self.gatherer.finish())
         self.update_counts()
         return self.gathered
@@ -108,7 +108,7 @@ class GatherStep:
     names: tuple = ()
     """Names of the recordings for messages; with several of them an error names the one at fault."""
     spread: bool = False
-    """Whether windows are kept to ask for effects."""
+    """Whether windows are kept for the search of effects."""
     progress: Callable[[int], object] | None = None
     """Called with the number of IMU samples read so far."""
     judged_from: float = 0.0
@@ -123,7 +123,7 @@ class GatherStep:
         """
         Return the Gathered of a recording, which is read once, for its windows and for the checks.
 
-        `windows` takes them all, unused ones too.
+        All windows, unused ones too, are appended to `windows`.
 
         Raises
         ------

@@ -11,7 +11,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
 
 LEVEL = 0.01
-"""Two calibrations disagree when chance alone would part them so far in fewer than this share of cases."""
+"""Significance level: two calibrations differ when the p-value is below this."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Row:
     second: float
     """Value in the second document."""
     sd: float
-    """Combined standard deviation, of what is known of both."""
+    """Combined standard deviation of both calibrations."""
     unit: str
     """SI unit."""
     ratio: float | None
@@ -39,13 +39,13 @@ class Comparison:
     rows: tuple
     """One Row per common parameter."""
     agree: bool | None
-    """Whether no group differs beyond chance, with the number of groups accounted for; None when nobody can tell."""
+    """Whether no group differs significantly, corrected for the number of groups; None when undecided."""
     lines: tuple
-    """The verdict in words."""
+    """The verdict as text."""
 
 
 def moved_beyond_sd(first: Calibration, second: Calibration) -> bool:
-    """Return whether a later calibration says something else: other parameters, or a value further off than the first one's own sd."""
+    """Return whether a later calibration differs: in its parameters, or in a value by more than the sd of the first."""
     if first.param_names != second.param_names:
         return True
     return bool(np.any(np.abs(second.values - first.values) > first.sd))
@@ -61,7 +61,7 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     Raises
     ------
     InputError
-        When the frames, gauges or the parameters have nothing in common.
+        When the frames or gauges differ, or no parameter is common.
 
     """
     common = [name for name in first.param_names if name in second.param_names]

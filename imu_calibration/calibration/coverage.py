@@ -1,4 +1,4 @@
-"""What a session has seen and what is still worth having: a sphere of directions that can be up, judged by information, not visits."""
+"""Attitudes of a session and the gain of further ones: a sphere of upward directions, rated by information instead of visits."""
 
 import itertools
 from collections.abc import Sequence
@@ -19,13 +19,13 @@ from imu_calibration.estimation.standard_motions import MOTIONS, rest_with_up
 DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)])
 """Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""
 ENOUGH = 0.02
-"""A cell that gives less than this share of what is missing is no longer worth a pose."""
+"""A cell with a gain below this share of the excess is not proposed for a pose."""
 MOST_MOTIONS, LEAST_GAIN = 20, 0.01
-"""Standard motions that are looked ahead at most, and the share of what is missing that the best one must take off."""
+"""Most standard motions that are planned ahead, and the least share of the excess that the best one must remove."""
 GAUGE_SHOWN = 1e-7
 """m; how exactly the origin is the mean of the sensitive points here."""
 LONGEST = 300.0
-"""s; standard motions that take longer gain too little per second, and are long to work out."""
+"""s; longer standard motions gain too little per second, and their computation is slow."""
 
 
 @dataclass(frozen=True)
@@ -42,32 +42,32 @@ class Bar:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What to do next."""
+    """The next step."""
 
     text: str
-    """For people; '' when nothing is missing."""
+    """Text for the user; '' when no motion is missing."""
     up: np.ndarray | None = None
     """Direction of the sensor frame to turn up and hold, unit vector, shape (3,)."""
     axis: np.ndarray | None = None
     """Axis of the sensor frame to turn about, counter-clockwise seen from its tip, unit vector, shape (3,)."""
     angle: float = 0.0
-    """How far, rad; 0: on and on."""
+    """Angle of the rotation, rad; 0: continuous."""
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """What is shown of a session."""
+    """The displayed state of a session."""
 
     worth: np.ndarray
-    """Share of what is missing that a rest with each of `DIRECTIONS` up would give, 0 to 1, shape (26,)."""
+    """Share of the excess that a rest with each of `DIRECTIONS` up would remove, 0 to 1, shape (26,)."""
     seen: np.ndarray
     """Directions that have been up at rest, unit vectors, shape (k, 3)."""
     up: np.ndarray | None
-    """What is up now, or at the last rest, shape (3,)."""
+    """Upward direction now, or at the last rest, shape (3,)."""
     next: Step
-    """What to do next."""
+    """The next step."""
     seconds: float
-    """What is left, s; NaN when nobody knows."""
+    """Remaining time, s; NaN when unknown."""
     bars: tuple[Bar, ...] = ()
     """Every parameter group."""
     arms: np.ndarray | None = None
@@ -91,12 +91,12 @@ def bars_of(groups: Sequence[GroupState]) -> tuple[Bar, ...]:
 
 
 def excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
-    """Return how far standard deviations are beyond their tolerances, summed: ``sum log max(sd / tolerance, 1)``; leading axes are kept."""
+    """Return the excess of standard deviations over their tolerances: ``sum log max(sd / tolerance, 1)``; leading axes are kept."""
     return np.log(np.maximum(sd / tolerances, 1.0)).sum(axis=-1)
 
 
 def share_gained(before: float, after: np.ndarray) -> np.ndarray:
-    """Return which share of the excess is taken off, 0 to 1."""
+    """Return the share of the excess that is removed, 0 to 1."""
     return np.clip((before - after) / before, 0.0, 1.0) if before > 0 else np.zeros_like(after)
 
 
@@ -104,8 +104,8 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     """
     Return the Coverage of a calibration on a table: each cell is a rest of five seconds with that direction up.
 
-    What is next is the standard motion that gains most per second, the seconds are those of it and all that are needed after it. Where
-    these would not do, it is what the solution names for the parameter worst off.
+    The next step is the standard motion with the largest gain per second; `seconds` is the time of it and of all later ones needed. If
+    these do not suffice, it is the motion that the solution proposes for the parameter with the largest sd in tolerances.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
 
     def expected_sd(information):
         return np.sqrt(np.clip(np.diag(inverse_normal(information)), 0, None))
-    # what the model misses widens standard deviations beyond what the information says, and will go on doing so
+    # unmodelled effects widen the standard deviations beyond those of the information matrix; the same factor is predicted
     wider = np.maximum(result.calibration.sd / np.maximum(expected_sd(base), 1e-300), 1.0)
 
     def left(information):
@@ -147,7 +147,7 @@ def _possible_motions(table):
 
 
 def _foretold(information, left, added, motions):
-    """Return (the first, seconds of all) of the motions that leave nothing; (None, NaN) where these motions do not get there."""
+    """Return (first motion, seconds of all) of the motions that remove the excess; (None, NaN) if these motions do not suffice."""
     first, seconds, missing = None, 0.0, left(information)
     more = [added(motion) for motion in motions] if missing else []
     for _ in range(MOST_MOTIONS):

@@ -1,4 +1,4 @@
-"""How a `Coverage` looks, in whatever it is drawn: radius and colours, size of a cell, the line of text."""
+"""Appearance of a `Coverage` in every viewer: radius and colours, size of a cell, the line of text."""
 
 from collections.abc import Iterator
 
@@ -25,7 +25,7 @@ def cells_of(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...]
 
 
 def line_of(coverage: Coverage) -> str:
-    """Return the one line that stands beside the sphere."""
+    """Return the line of text next to the sphere."""
     if coverage.done:
         return 'all parameters are determined: save the calibration'
     what = coverage.next.text or 'go on'

@@ -12,7 +12,7 @@ HARM = 1.05
 LATE = 1e-3
 """Delays from this size on are named as a cause, s."""
 AT_REST = 0.7
-"""An error at rest of this share of the whole comes from the bias."""
+"""An error at rest of at least this share of the total is attributed to the bias."""
 DELAY_SHARE = 0.1
 """A delay is named as a cause where it explains this share of the residual."""
 ONE_ATTITUDE = '; unproven for other attitudes, because all held-out windows have the same attitude'
@@ -20,7 +20,7 @@ NO_PROOF = 'its error on held-out data was not measured'
 
 
 class SensorDecision(StrEnum):
-    """Whether the calibration of a sensor helps; a document holds the word."""
+    """Whether the calibration of a sensor helps; stored as text in a document."""
 
     HELPS = 'helps'
     """The 95 % interval of error after / error before lies below 1."""

@@ -1,4 +1,4 @@
-"""The calibration: what a recording says about an IMU, as a document that people and nodes exchange."""
+"""The calibration of an IMU, estimated from recordings, as a document that users and nodes exchange."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 FORMAT = 'imu_calibration/1'
 UNKNOWN = 'unknown'
-"""What the provenance says of the uncertainty of imported values."""
+"""Entry of the provenance for the uncertainty of imported values."""
 _WHERE_KNOWN = ('decision', 'decision_reasons', 'notes', 'proof')
-"""Parts of a document that are left out while nobody knows them."""
+"""Parts of a document that are omitted while unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class Calibration:
     """Parameters within tolerance, warnings, notes and next steps, a line each."""
     proof: dict = field(default_factory=dict)
     """
-    Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on data that took no part; {}: never measured.
+    Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on held-out data; {}: never measured.
     """
     covariance_terms: dict[str, np.ndarray] = field(default_factory=dict)
     """Term (`estimation.covariance_terms`) -> its variance of each parameter, shape (n_params,); the sum is that of `covariance`."""
@@ -102,7 +102,7 @@ class Calibration:
         """
         Return (standard deviation of a sample, sd of window offsets and wander), each shape (3,), from the statistics.
 
-        With a density of the noise and a `period` (s), the sample is one at that rate; else at that of the recording.
+        With a noise density and a `period` (s), the sample sd is for that rate; else for the rate of the recording.
         """
         found = self.statistics.get(sensor, {})
         white = np.asarray(found.get('noise_sd', [0.0] * 3), float)
@@ -112,7 +112,7 @@ class Calibration:
 
     @property
     def uncertainty_known(self) -> bool:
-        """Whether somebody knows how certain the values are: of those that another program made nobody does."""
+        """Whether the uncertainty of the values is known; that of imported values is not."""
         return self.provenance.get('uncertainty') != UNKNOWN
 
     @property
@@ -126,7 +126,7 @@ class Calibration:
 
     @property
     def requested(self) -> dict[str, str]:
-        """Status of the parameters that somebody asks for, by name; table, clock and the common arm are nuisances."""
+        """Status of the requested parameters, by name; table, clock and the common arm are nuisances."""
         return {name: status for name, status, wanted in zip(self.param_names, self.status, self.model.requested) if wanted}
 
     def all_determined(self) -> bool:
@@ -136,14 +136,14 @@ class Calibration:
     def compensate(self, samples: ImuSamples | np.ndarray, rate_s: np.ndarray | None = None, *, time: np.ndarray | None = None,
                    temperature_c: Any = None) -> ImuSamples | tuple[np.ndarray, np.ndarray]:
         """
-        Return readings with the calibrated errors taken out; see `compensation.arrays.compensate_readings`.
+        Return readings with the calibrated errors removed; see `compensation.arrays.compensate_readings`.
 
         Parameters
         ----------
         samples : ImuSamples, or array_like, shape (n, 3)
             Readings of one IMU in order of time, or measured specific force in the sensor frame, m/s^2.
         rate_s : array_like, shape (n, 3), optional
-            Measured angular rate beside the specific force, rad/s.
+            Measured angular rate of the same samples, rad/s.
         time : array_like, shape (n,), optional
             When the arrays were measured, s; needed where the sensitive points have lever arms.
         temperature_c : float, array_like of shape (n,), or TemperatureSamples, optional
@@ -152,7 +152,7 @@ class Calibration:
         Returns
         -------
         ImuSamples, or (ndarray, ndarray)
-            Specific force and rate as they were given; NaN where a reading cannot be corrected.
+            Corrected specific force and rate, of the same type as the input; NaN where a reading cannot be corrected.
 
         """
         from imu_calibration.compensation.arrays import compensate_readings

@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 CONDITION_LIMIT = 20.0
 """A sensor matrix with a larger condition number cannot belong to three independent axes."""
 LARGEST = 1e9
-"""Values and standard deviations beyond this belong to no sensor in any unit; their products would leave the range of numbers."""
+"""Values and standard deviations above this occur with no sensor in any unit; their products would overflow."""
 RANGE_C = (-273.15, 1000.0)
 """Temperatures of a sensor, degrees Celsius."""
 MOST_JOINTS = 30
 ROUNDING = 1e-6
-"""By this much, relative to the variances, rounding may take a covariance out of what a covariance can be."""
+"""Tolerance for rounding, relative to the variances, of the test that a covariance is positive semidefinite."""
 
 
 def _is_number(value, low=-LARGEST, high=LARGEST):
@@ -99,7 +99,7 @@ KNOWN = {
     'notes': _is_list_of(_is_text),
     'proof': {sensor: _is_proof for sensor in SENSORS},
 }
-"""Part of a document -> what it must be, when it is there: a function, or a mapping whose entries are told in the same way."""
+"""Part of a document -> requirement if present: a function, or a mapping with requirements of its entries."""
 
 
 def check_parts(document: Mapping, known: Mapping = KNOWN, place: str = '') -> None:

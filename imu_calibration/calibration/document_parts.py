@@ -1,4 +1,4 @@
-"""From the mapping of a calibration document to the parts of a `Calibration`: its layout, nothing about its numbers."""
+"""From the mapping of a calibration document to the parts of a `Calibration`: its layout; the numbers are not checked."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,12 +16,12 @@ from imu_calibration.reference.joint import JointNames
 
 def parts_of(document: Mapping) -> dict[str, Any]:
     """
-    Return {field of a Calibration: value} from the mapping of its document, whose parts have passed `check_parts`.
+    Return {field of a Calibration: value} from the mapping of its document, after `check_parts`.
 
     Raises
     ------
     DocumentError, KeyError, TypeError, ValueError, AttributeError, OverflowError
-        When something is missing or misshapen.
+        When a part is missing or has the wrong form.
 
     """
     model, entries = _model(document)
@@ -45,7 +45,7 @@ def parts_of(document: Mapping) -> dict[str, Any]:
 
 
 def _model(document):
-    """Return (SensorModel, {(sensor, effect): what the document says of it})."""
+    """Return (SensorModel, {(sensor, effect): entry of the document})."""
     joint_names = JointNames.of(document.get('joint_names', JOINTS), document.get('joint_errors'))
     catalogue = Catalogue.from_definitions(document.get('effects') or {})
     owners = {effect.name: effect.sensor for effect in catalogue.effects(joint_names).values() if effect.in_reference}

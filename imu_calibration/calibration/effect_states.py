@@ -1,4 +1,4 @@
-"""What is known of each effect of a calibration that goes on: determined, weak, held or waiting, and the motion that is still needed."""
+"""State of each effect of a running calibration: determined, weak, held or waiting, and the motion that is still needed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 
 
 class Progress(StrEnum):
-    """How far a session has come with an effect, or with everything."""
+    """Progress of a session with an effect, or of the session in total."""
 
     WAITING = 'waiting'
     """There is no solution yet."""
@@ -23,7 +23,7 @@ class Progress(StrEnum):
 
 @dataclass(frozen=True)
 class GroupState:
-    """What is known of one effect of one sensor."""
+    """State of one effect of one sensor."""
 
     sensor: str
     """'accelerometer', 'gyroscope' or 'reference'."""
@@ -32,7 +32,7 @@ class GroupState:
     status: Progress
     """That of the worst of its parameters."""
     parameter: str
-    """The parameter whose standard deviation is largest in tolerances."""
+    """The parameter with the largest standard deviation in tolerances."""
     sd: float
     """Its standard deviation, SI; NaN before the first solution."""
     tolerance: float
@@ -67,7 +67,7 @@ def group_status(statuses: Sequence[str]) -> Progress:
 
 
 def waiting_groups(model: SensorModel) -> list[GroupState]:
-    """Return the GroupState of every effect of a model of which nothing is known yet."""
+    """Return the GroupState of every effect of a model without data."""
     texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
     return [GroupState(e.sensor, e.name, Progress.WAITING, e.param_names()[0], float('nan'), e.tolerance, e.unit_of(0), texts[e.motion[0]])
             for e in model.effects]

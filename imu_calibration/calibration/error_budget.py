@@ -1,9 +1,9 @@
 """
-Error budget as section V of Avrutov 2017 meant it: the standard error from noise beside what the reference contributes.
+Error budget after section V of Avrutov 2017: the standard error from noise and the contributions of the reference.
 
 The paper sums errors of the reference and of the outputs as if they were independent, with sign. Noise gives the covariance of the
-solution; a wrong reference that changes the predicted output by ``dA c`` moves the parameters by ``G^+ dA c``, where the rows err
-together when the table is not level and apart when an encoder is read anew in every pose.
+solution; a wrong reference that changes the predicted output by ``dA c`` moves the parameters by ``G^+ dA c``, where errors of the rows
+are common when the table is not level and independent when an encoder is read in every pose.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from imu_calibration.calibration.table_result import TableResult
 
 MOVING_SAMPLES = 20_000
-"""Samples of moving windows that are looked at: every so many of them stand for all."""
+"""Most samples of moving windows that are used; they are subsampled evenly beyond it."""
 
 
 @dataclass(frozen=True)
 class ReferenceErrors:
-    """Standard deviations of what the reference is made of."""
+    """Standard deviations of the parts of the reference."""
 
     levelling: float = setting(2 * ARCMIN, 'rad', 'levelling of the table, each of two directions; counts when table_tilt is not estimated',
                                (0.0, 0.1))
@@ -53,7 +53,7 @@ class ErrorBudget:
     causes: dict
     """Cause -> standard deviations, shape (n_params,); 'noise' first."""
     texts: dict
-    """Cause -> what was assumed."""
+    """Cause -> assumption."""
 
     @property
     def total(self) -> np.ndarray:
@@ -65,8 +65,8 @@ def error_budget(result: 'TableResult', errors: ReferenceErrors = ReferenceError
     """
     Return the ErrorBudget of a calibration on a table.
 
-    First order, around the solution; weights as the solver takes them. Windows at rest enter all, moving windows as far as their
-    samples were kept.
+    First order, around the solution; weights of the solver. All windows at rest are used, and the moving windows with kept
+    samples.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def error_budget(result: 'TableResult', errors: ReferenceErrors = ReferenceError
 
 
 def _causes(result, errors, gravity_sd):
-    """Return (name, text, scattered, changes); a change turns (table, motion) into what they truly are, one sd away."""
+    """Return (name, text, scattered, changes); a change maps (table, motion) to values that differ by one sd."""
     found = []
     if result.solution.model.find('reference', Role.TILT) is None:
         text = f'levelling {errors.levelling / ARCMIN:.2g} arcmin in each direction, not estimated'
@@ -229,7 +229,7 @@ def _piece(result, changes, kind, time, session, count, stride, motion, temperat
 
 
 def _known(model, motion, temperature):
-    """Return temperatures where the model needs them; at rest their mean was not kept and the reference temperature stands in."""
+    """Return temperatures if the model needs them; the mean at rest is not kept, so that the reference temperature is used there."""
     return np.full(len(motion), model.temperature_ref_c) if model.needs_temperature and temperature is None else temperature
 
 

@@ -23,7 +23,7 @@ class Unit:
     name: str
     """Name of the unit."""
     sources: tuple
-    """Callables that yield the blocks of a recording, each time anew; they must survive pickling when sent elsewhere."""
+    """Callables that yield the blocks of a recording from its start at each call; must be picklable for another process."""
     bags: tuple = ()
     """Names of the recordings."""
     provenance: object = None
@@ -32,7 +32,7 @@ class Unit:
 
 @dataclass(frozen=True, eq=False)
 class UnitResult:
-    """What calibrating one unit gave; small enough to be sent back."""
+    """Result of one unit; small enough to be sent between processes."""
 
     name: str
     """Name of the unit."""
@@ -45,7 +45,7 @@ class UnitResult:
     error: str = ''
     """Why the unit was refused, one line."""
     key: str | None = None
-    """What has to be given, a key of `errors.KEYS`."""
+    """The missing input, a key of `errors.KEYS`."""
     files: dict | None = None
     """File name -> text."""
 
@@ -67,17 +67,17 @@ class FleetStep:
     table: Table
     """The table on which every unit was recorded."""
     options: CalibrationOptions = CalibrationOptions()
-    """What to estimate."""
+    """Model and settings of the estimate."""
     report: Callable[[CalibrationResult], str] | None = None
     """Returns report.html; must survive pickling when sent elsewhere."""
 
     def __call__(self, unit: Unit) -> UnitResult:
-        """Return the UnitResult of a unit; whatever goes wrong with it is part of the result."""
+        """Return the UnitResult of a unit; every error of it is part of the result."""
         try:
             return self._calibrated(unit)
         except ImuCalibrationError as error:
             return UnitResult(unit.name, error=' '.join(str(error).split()), key=error.key)
-        except Exception as error:   # a fleet goes on past a unit, whatever is the matter with it
+        except Exception as error:   # a failed unit does not end the run of the fleet
             return UnitResult(unit.name, error=f'stopped by {type(error).__name__}: {" ".join(str(error).split())}')
 
     def _calibrated(self, unit):
@@ -154,5 +154,5 @@ def _spread(name, unit, found):
 
 
 def fleet_exit_code(results: Iterable[UnitResult]) -> int:
-    """Return 0 when every unit ended with 0, else 3."""
+    """Return 0 when the exit code of every unit is 0, else 3."""
     return 0 if all(result.exit_code == 0 for result in results) else 3

@@ -81,7 +81,7 @@ def _besides(directions, needed, in_tolerances):
 
 
 def with_gravity_uncertainty(solution: Solution, table: Table) -> Solution:
-    """Return the solution with the uncertainty of gravity, which scales the accelerometer matrix as a whole, in its covariance."""
+    """Return the solution with the uncertainty of gravity, a common scale of the accelerometer matrix, in its covariance."""
     direction = np.zeros(len(solution.values))
     part = solution.model.part('accelerometer', Role.LINEAR)
     direction[part] = solution.values[part] * table.gravity_sd_value / table.gravity_value
@@ -103,7 +103,7 @@ def with_weak_replaced(solution: Solution, tolerances: np.ndarray) -> Solution:
 
 
 def statistics(solution: Solution, gathered: Gathered) -> dict:
-    """Return the statistics section: noise, residuals, chi-square, windows, what was dropped."""
+    """Return the statistics section: noise, residuals, chi-square, windows, dropped samples."""
     result = {}
     for sensor in SENSORS:
         noise = solution.noise[sensor]
@@ -127,7 +127,7 @@ def statistics(solution: Solution, gathered: Gathered) -> dict:
 
 
 def preflight_statistics(findings: Sequence[CheckFinding]) -> dict:
-    """Return the part of the statistics that says what a look at the recording found."""
+    """Return the findings of the checks of the recording as a part of the statistics."""
     return {'preflight': [finding.to_mapping() for finding in warnings(findings)], 'unusable': unusable(findings)}
 
 

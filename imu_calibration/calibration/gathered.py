@@ -1,4 +1,4 @@
-"""What the map step of a calibration leaves behind, and how the parts of several recordings join."""
+"""The result of the map step of a calibration, and the merge of the results of several recordings."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,23 +14,23 @@ from imu_calibration.estimation.window_statistics import WindowStatistics
 KEPT_SAMPLES = 200_000
 """Samples of moving windows kept for plots and for the autocorrelation of residuals."""
 MOST_ASKED = 4
-"""Recordings of which windows are kept to ask for effects."""
+"""Most recordings with windows kept for the search of effects."""
 KEPT_POSES = 2000
-"""Static windows whose joint positions are kept."""
+"""Most static windows with kept joint positions."""
 
 
 @dataclass(eq=False)
 class Gathered:
-    """What a recording leaves behind."""
+    """Reduced data of a recording."""
 
     accumulator: Accumulator = field(default_factory=Accumulator)
     """The least-squares system."""
     held_out: HeldOut = field(default_factory=HeldOut)
-    """The same windows dealt out, so that each part can be predicted from the others."""
+    """The same windows in folds for cross-validation."""
     kept: list = field(default_factory=list)
-    """Windows with all samples, as far as KEPT_SAMPLES reaches."""
+    """Windows with all samples, up to KEPT_SAMPLES."""
     spreads: list[SpreadWindows] = field(default_factory=lambda: [SpreadWindows()])
-    """Windows to ask for effects, of each of the recordings with most samples, the largest first; none where nobody asks."""
+    """Windows for the search of effects, of each of the recordings with most samples, the largest first; empty without a search."""
     poses: list = field(default_factory=list)
     """(time, session, joint positions) of each static window."""
     counts: dict = field(default_factory=dict)
@@ -48,13 +48,13 @@ class Gathered:
     temperature_c: tuple | None = None
     """Lowest and highest temperature."""
     findings: tuple = ()
-    """What a look at the recording found before anything was estimated (`preflight.finding.CheckFinding`)."""
+    """Findings of the checks of the recording before the estimate (`preflight.finding.CheckFinding`)."""
 
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
 
     def take(self, window: WindowStatistics) -> None:
-        """Take a reduced window."""
+        """Add a reduced window."""
         self.accumulator.add(window)
         self.held_out.add(window, window.time >= self.judged_from)
 
@@ -67,7 +67,7 @@ class Gathered:
 
     @property
     def moving(self) -> list:
-        """Moving windows with all their samples, as far as they are kept: live those that are asked for effects."""
+        """Moving windows with all their kept samples; live, the windows of the search of effects."""
         return self.kept or [window for spread in self.spreads for window in spread.windows if window.kind != 'static']
 
     @property
@@ -77,7 +77,7 @@ class Gathered:
 
 
 def merge(parts: Iterable[Gathered]) -> Gathered:
-    """Join what several recordings left behind: the merge step of calibration."""
+    """Merge the reduced data of several recordings: the merge step of calibration."""
     parts = list(parts)
     total = parts[0]
     for part in parts[1:]:

@@ -1,4 +1,4 @@
-"""Windows dealt out into blocks, at constant memory: what each fold of them says, and what the others say of it."""
+"""Windows distributed over blocks, at constant memory: sums of each fold, and its prediction from the remaining folds."""
 
 from dataclasses import dataclass, field
 
@@ -16,9 +16,9 @@ from imu_calibration.estimation.weighted_system import WeightedSystem
 from imu_calibration.estimation.window_statistics import WindowStatistics
 
 FOLDS = 8
-"""Parts that are predicted from the others in turn."""
+"""Folds of the cross-validation."""
 BLOCKS = 3 * FOLDS
-"""Parts that are drawn anew for an interval; block k belongs to fold k modulo FOLDS."""
+"""Blocks that are resampled for an interval; block k belongs to fold k modulo FOLDS."""
 
 
 @dataclass(eq=False)
@@ -32,10 +32,10 @@ class HeldOutBlock:
     counts: dict[str, int] = field(default_factory=dict)
     """Regime -> number of pieces."""
     judged: int = 0
-    """Windows whose pieces are kept."""
+    """Windows with kept pieces."""
 
     def add(self, window: WindowStatistics, judged: bool = True) -> None:
-        """Take a window, and its pieces where it is judged."""
+        """Add a window, and its pieces if it is judged."""
         self.accumulator.add(window)
         if not judged:
             return
@@ -48,7 +48,7 @@ class HeldOutBlock:
             self.counts[regime] = self.counts.get(regime, 0) + count
 
     def merge(self, other: 'HeldOutBlock') -> None:
-        """Take everything of another block."""
+        """Add the content of another block."""
         self.accumulator.merge(other.accumulator)
         for key, factor in other.pieces.items():
             stack(self.pieces, key, factor)
@@ -57,7 +57,7 @@ class HeldOutBlock:
         self.judged += other.judged
 
     def copy(self) -> 'HeldOutBlock':
-        """Return a block that goes its own way."""
+        """Return an independent copy."""
         return HeldOutBlock(self.accumulator.copy(), dict(self.pieces), dict(self.counts), self.judged)
 
     def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOutBlock':
@@ -73,24 +73,24 @@ class HeldOut:
     """
     Blocks of windows.
 
-    The windows of each kind are dealt out in turn, whole, so that every block holds of everything that happened, and memory does not grow
+    Undivided windows of each kind are assigned to blocks in turn, so that every block has windows of each kind, and memory does not grow
     with the session.
     """
 
     blocks: list[HeldOutBlock] = field(default_factory=lambda: [HeldOutBlock() for _ in range(BLOCKS)])
 
     def add(self, window: WindowStatistics, judged: bool = True) -> None:
-        """Take a window, and its pieces where it is judged."""
+        """Add a window, and its pieces if it is judged."""
         dealt = sum(block.accumulator.windows.get(window.kind, 0) for block in self.blocks)
         self.blocks[dealt % BLOCKS].add(window, judged)
 
     def merge(self, other: 'HeldOut') -> None:
-        """Take everything of another one; its windows follow this one's."""
+        """Add the content of another object; its windows follow the existing ones."""
         for mine, its in zip(self.blocks, other.blocks):
             mine.merge(its)
 
     def copy(self) -> 'HeldOut':
-        """Return one that goes its own way."""
+        """Return an independent copy."""
         return HeldOut([block.copy() for block in self.blocks])
 
     def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOut':
@@ -104,14 +104,14 @@ class HeldOut:
 
     @property
     def n_judged(self) -> int:
-        """Windows whose pieces are kept."""
+        """Windows with kept pieces."""
         return sum(block.judged for block in self.blocks)
 
     def values_without(self, solution: Solution) -> list[np.ndarray]:
         """
-        Return the parameters without each fold: one Gauss-Newton step from the solution with the fold left out of the normal equations.
+        Return the parameters without each fold: one Gauss-Newton step from the solution, on the rows of the remaining folds.
 
-        Noise and held parameters stay those of the solution; what a fold alone had shown goes to its prior.
+        Noise and held parameters are those of the solution; a parameter that only the fold determines is set to its prior.
         """
         model, prior, values = solution.model, make_prior(solution.model), solution.values
         free = ~fixed_parameters(model) & ~solution.held

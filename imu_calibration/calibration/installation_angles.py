@@ -14,9 +14,9 @@ from imu_calibration.samples import NominalScaling
 @dataclass(frozen=True, eq=False)
 class Derived:
     """
-    What the matrix of one sensor says about its three sensing elements.
+    Parameters of the three sensing elements, derived from the matrix of one sensor.
 
-    Row i of the matrix is ``scale_i * unit vector along element i`` (Zhang 2017, eq. 5-9, with the rows of the cosines made unit).
+    Row i of the matrix is ``scale_i * unit vector along element i`` (Zhang 2017, eq. 5-9, with the rows of the cosines normalised).
     """
 
     sensor: str
@@ -119,7 +119,7 @@ def in_paper_units(derived: Derived,
     ----------
     derived : Derived
     nominal : NominalScaling, optional
-        The conversion with which the recording was read; None: it came in SI units.
+        The conversion with which the recording was read; None: the recording is in SI units.
 
     """
     accelerometer = derived.sensor == 'accelerometer'

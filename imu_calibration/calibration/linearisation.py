@@ -1,4 +1,4 @@
-"""Whether a solution lies too far from where its columns were taken, and where they should be taken instead."""
+"""Test of the validity of a linearisation at the solution, and selection of the next point."""
 
 from dataclasses import replace
 
@@ -9,17 +9,17 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 
 PASSES = 6
-"""Passes over a recording at most, when effects have to be linearised anew."""
+"""Most passes over a recording with repeated linearisation."""
 
 
 STARTS = 6
-"""Time constants from which the iteration starts, a factor of 2.3 apart: it converges from a start within this factor."""
+"""Number of start values of the time constant, with a ratio of 2.3: the iteration converges from a start within this factor."""
 LINEAR_STEPS = 25
-"""Steps of a numerical derivative (5 ms of a delay) over which a linearisation is believed in directions that are hardly seen."""
+"""Steps of a numerical derivative (5 ms of a delay) up to which a linearisation is valid in weakly determined directions."""
 
 
 def linearise_again(model: SensorModel, solution: Solution) -> SensorModel | None:
-    """Return the model linearised at a solution that lies too far from where its columns were taken, else None."""
+    """Return the model linearised at a solution outside the validity of its linearisation, else None."""
     return model.at(model.start_from(solution.model, _cautious(solution))) if _needs_another_pass(model, solution) else None
 
 
@@ -31,10 +31,10 @@ def at_time_constants(model: SensorModel, effect: Effect, duration: float) -> li
 
 def _cautious(solution):
     """
-    Return values to linearise at: those of the solution, but for directions that the recording hardly shows.
+    Return values to linearise at: those of the solution, except along weakly determined directions.
 
-    At zero a lag and a delay are the same to first order. What tells them apart, and how far, is only seen from a point where both act;
-    a full step along their difference would lead anywhere. So the step is the solution's with a pull of LINEAR_STEPS towards the point.
+    At zero, lag and delay have the same first derivative. They are separable only at a point where both are nonzero;
+    a full step along their difference would be arbitrary. The step is therefore regularised with LINEAR_STEPS towards the point.
     """
     model, values = solution.model, solution.values
     move, pull = np.zeros(len(values)), np.zeros(len(values))
@@ -52,7 +52,7 @@ def _cautious(solution):
 
 
 def _needs_another_pass(model, solution):
-    """Return whether an effect moved so far from where its columns were taken that the first derivative no longer holds."""
+    """Return whether an effect moved beyond the validity of its first derivative."""
     for effect in model.relinearised:
         if effect.key not in solution.model.slices:
             continue

@@ -1,4 +1,4 @@
-"""Calibration while the motion goes on: windows as they complete, a solution after them, the same answer as offline."""
+"""Calibration during the motion: windows and solutions while data arrive, with the same result as offline."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -36,21 +36,21 @@ HELD_BACK = 200
 
 class LiveCalibration:
     """
-    One session as it happens: `push` what arrives, `solve` when it is due.
+    One live session: `push` for new blocks, `solve` when it is due.
 
-    Windows are found and reduced by the very objects that read recordings, and solved by the same functions, so the answer is
-    that of `calibrate_by_evidence` on the same samples, once what they demand was asked (`last`, `LiveSnapshot.evidence`) and adopted.
-    Memory is bounded: samples in reduced form, a bounded store of windows for columns that must be taken anew.
+    Windows are found and reduced by the same objects as for recordings, and solved by the same functions, so that the result is
+    that of `calibrate_by_evidence` on the same samples, after the search of effects (`last`, `LiveSnapshot.evidence`) and `adopt`.
+    Memory is bounded: samples in reduced form, a bounded store of windows for columns that must be computed again.
 
     Parameters
     ----------
     table : Table
         The reference.
     options : CalibrationOptions
-        What to estimate.
+        Model and settings of the estimate.
     settings : LiveSettings
     saved : bytes, optional
-        What `saved` of an earlier run returned; this session is then merged with it, at its reference temperature.
+        The bytes from `saved` of an earlier run; this session is then merged with it, at its reference temperature.
 
     Raises
     ------
@@ -64,14 +64,14 @@ class LiveCalibration:
         self.table, self.options, self.settings = table, options, settings
         self.earlier: Gathered | None = None
         self.demand = Demand() if saved is None or options.as_asked else accumulator_state.saved_demand(saved)
-        """What joined the model that was asked for."""
+        """Effects added to the requested model."""
         self._asked = choose_model(self.demand.options(options), table)
         self._waiting: list[SampleBlock] = []
         self._collector: LiveCollector | None = None
         self._first_temperature_c: float | None = None
         self.result: TableResult | None = None
         self.last: LiveSnapshot | None = None
-        """What the last solution was made of."""
+        """The data of the last solution."""
         self._too_far, self._designs = False, {}
         if saved is not None and self._asked.needs_temperature:
             self._first_temperature_c = accumulator_state.saved_model(saved).temperature_ref_c
@@ -90,7 +90,7 @@ class LiveCalibration:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Samples of this run by what became of them."""
+        """Samples of this run by their use."""
         if self._collector is None:
             return {}
         self._collector.update_counts()
@@ -103,7 +103,7 @@ class LiveCalibration:
 
     @property
     def needs_temperature(self) -> bool:
-        """Whether an effect that was asked for depends on temperature."""
+        """Whether a requested effect depends on temperature."""
         return self._asked.needs_temperature
 
     @property
@@ -120,25 +120,25 @@ class LiveCalibration:
 
     @property
     def on_table(self) -> TableSession:
-        """The session itself: what the model gets wrong can be asked while it goes on."""
+        """The session itself: model errors can be diagnosed while it runs."""
         return self
 
     def change_by_hand(self, by_hand: LiveByHandSettings) -> None:
-        """Do nothing: gravity is the table's."""
+        """No effect: gravity is given by the table."""
 
     @property
     def model(self) -> SensorModel | None:
-        """The model whose columns are gathered; None while a thermal effect waits for the first temperature."""
+        """The model of the gathered columns; None while a thermal effect waits for the first temperature."""
         return None if self._collector is None else self._collector.model
 
     def push(self, block: SampleBlock) -> list[Window]:
         """
-        Take what arrived and return the windows that it completed (list of Window).
+        Process a block and return the windows that it completed (list of Window).
 
         Raises
         ------
         InputError
-            When the joint states do not hold the table's joints.
+            When the joint states do not contain the table's joints.
 
         """
         if self._first_temperature_c is None and block.temperature is not None and len(block.temperature):
@@ -149,7 +149,7 @@ class LiveCalibration:
         return self._completed()
 
     def _completed(self):
-        """Return the windows since the last call; their columns stay until the next one."""
+        """Return the windows since the last call; their columns are kept until the next call."""
         self._designs = self._collector.take_completed()
         return list(self._designs)
 
@@ -174,20 +174,20 @@ class LiveCalibration:
 
     def solve(self, pending: bool = False, provenance: dict | None = None) -> TableResult:
         """
-        Solve what was gathered and return the CalibrationResult, which stays in `result`.
+        Solve the gathered data and return the CalibrationResult, which is kept in `result`.
 
         Parameters
         ----------
         pending : bool
-            Count the windows in that are still open, as the end of a recording would; the session goes on as if nothing had
-            happened.
+            Include the windows that are still open, as at the end of a recording; the session itself is
+            unchanged.
         provenance : dict, optional
             For the document.
 
         Raises
         ------
         NotObservableError
-            When no window is complete yet, or nothing is determined.
+            When no window is complete yet, or no parameter is determined.
         InputError
             When the units are plainly wrong.
 
@@ -205,9 +205,9 @@ class LiveCalibration:
 
     def adopt(self, demand: Demand) -> bool:
         """
-        Take what windows of this session demand into the model of all solutions from now on; return whether anything changes.
+        Add the effects that windows of this session support to the model of all further solutions; return whether the model changes.
 
-        Nothing changes where the model stays as it was asked for, nor where windows that need other columns are no longer kept.
+        No change with the option `as_asked`, or when windows that need other columns are no longer kept.
         """
         collector = self._collector
         if collector is None or self.last is None or self.options.as_asked or demand.is_nothing and self.demand.is_nothing:
@@ -222,17 +222,17 @@ class LiveCalibration:
         return True
 
     def needs_linearising(self) -> bool:
-        """Return whether the last solution lies too far from where its columns were taken, and the store is too small to go there."""
+        """Return whether the last solution is outside the validity of its linearisation, and the store is too small to linearise again."""
         return self._too_far
 
     def gathered(self, pending: bool = False) -> Gathered:
-        """Return everything that was gathered, an earlier run included, to be saved."""
+        """Return all gathered data, an earlier run included, to be saved."""
         if self._collector is None:
             return self.earlier or Gathered()
         return self._with_earlier(self._collector.snapshot(pending)[0])
 
     def saved(self, pending: bool = False) -> bytes:
-        """Return everything that was gathered as bytes, for another run (see `accumulator_state`)."""
+        """Return all gathered data as bytes, for another run (see `accumulator_state`)."""
         return accumulator_state.to_bytes(self.gathered(pending), self._begun().model, self.demand)
 
     def _begun(self) -> LiveCollector:
@@ -258,7 +258,7 @@ class LiveCalibration:
         return ImuSamples.concatenate(parts)
 
     def _told(self, window):
-        """Return the samples of a window whose residuals are told."""
+        """Return the samples of a window with published residuals."""
         every = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
         return slice(every // 2 if len(window) > every // 2 else 0, None, every)
 
@@ -284,4 +284,4 @@ class LiveCalibration:
         return group_states(self.result)
 
     def status(self, hints: dict[str, str] | None = None) -> SessionStatus | None:
-        """Return None: the groups tell what is missing."""
+        """Return None: the missing motions are in the groups."""

@@ -1,4 +1,4 @@
-"""The collector of a live calibration: what completed windows leave for residuals, a bounded store, copies to solve meanwhile."""
+"""The collector of a live calibration: samples of completed windows for residuals, a bounded store, copies for the solver."""
 
 import copy
 from collections.abc import Callable
@@ -50,16 +50,16 @@ class LiveCollector(Collector):
         self.gathered.spreads[0].add(kept)
 
     def take_model(self, model: SensorModel) -> None:
-        """Gather the columns of another model from now on; those of all windows so far are taken anew."""
+        """Gather the columns of another model from now on; those of all kept windows are computed again."""
         self.model, self.gathered = model, self.gathered.anew(self.store.reduced(model, self.table, self.session))
 
     def take_completed(self) -> dict[Window, tuple[slice, dict[str, np.ndarray]]]:
-        """Return the windows since the last call, each with the samples whose residuals are told and its columns there."""
+        """Return the windows since the last call, each with the samples for published residuals and their columns."""
         completed, self._completed = self._completed, {}
         return completed
 
     def snapshot(self, pending: bool) -> tuple[Gathered, WindowStore]:
-        """Return copies of what was gathered and of the store, with `pending` the windows that are still open closed in them."""
+        """Return copies of the gathered data and of the store; with `pending`, open windows are closed in the copies."""
         twin = copy.copy(self)
         twin.gathered, twin.store, twin._completed = copied(self.gathered), self.store.copy(), {}
         if pending:
@@ -71,6 +71,6 @@ class LiveCollector(Collector):
 
 
 def copied(gathered: Gathered) -> Gathered:
-    """Return a copy that shares only what nobody changes in place."""
+    """Return a copy that shares only objects that are never changed in place."""
     return replace(gathered, accumulator=gathered.accumulator.copy(), held_out=gathered.held_out.copy(), poses=list(gathered.poses),
                    kept=[], counts=dict(gathered.counts), spreads=[spread.copy() for spread in gathered.spreads])

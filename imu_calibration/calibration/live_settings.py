@@ -1,4 +1,4 @@
-"""What a calibration that goes on solves, keeps and tells, and what it takes where no table is the reference."""
+"""Settings of a live calibration: solving, storage and published data, and the reference without a table."""
 
 from dataclasses import dataclass, replace
 
@@ -9,7 +9,7 @@ from imu_calibration.settings import setting
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """How often to solve, and what is kept and told."""
+    """Solving interval, storage and published data."""
 
     solve_share: float = setting(0.1, '1', 'largest share of the time for solving after each window', (0.001, 1.0),
                                  'too small: late results; too large: the node uses a whole core', live=True)

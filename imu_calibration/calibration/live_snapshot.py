@@ -1,4 +1,4 @@
-"""What a live session has gathered at one moment: it is solved, and asked what it demands, while the session goes on."""
+"""Data of a live session at one time, for a solution and a search of effects while the session runs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,35 +17,35 @@ from imu_calibration.reference.table import Table
 
 @dataclass(frozen=True, eq=False)
 class LiveSnapshot:
-    """What was gathered, in copies that nobody changes."""
+    """Unchanging copies of the gathered data."""
 
     gathered: Gathered
-    """An earlier run included, with the windows to ask."""
+    """An earlier run included, with the windows of the search."""
     model: SensorModel
-    """The model whose columns it holds."""
+    """The model of its columns."""
     table: Table
     """The reference."""
     options: CalibrationOptions
-    """What is asked for."""
+    """Options of the requested model."""
     demand: Demand
-    """What joined the model since."""
+    """Effects added to the model."""
     store: WindowStore
     """The windows of this run, while they are all kept."""
     session: int
     """Number of this run."""
     temperature_c: float | None
-    """The first temperature, degrees Celsius; None: none came."""
+    """The first temperature, degrees Celsius; None: no temperature received."""
 
     def model_for(self, options: CalibrationOptions) -> SensorModel:
-        """Return the model whose columns options ask for."""
+        """Return the model of the columns for options."""
         model = choose_model(options, self.table)
         return model.with_reference_temperature(self.temperature_c) if model.needs_temperature and self.temperature_c is not None else model
 
     def solved(self, options: CalibrationOptions) -> Solved:
         """
-        Return (Solution, Gathered, the SensorModel whose columns were used) of other options, as a recording would be read for them.
+        Return (Solution, Gathered, SensorModel of the columns) for other options, as from a recording.
 
-        Where the windows are no longer kept, the columns are those that were gathered.
+        If the windows are no longer kept, the gathered columns are used.
         """
         model, total, moved = self.model, self.gathered, self.model_for(options)
         check_units(total, model, self.table)
@@ -61,7 +61,7 @@ class LiveSnapshot:
         return solution, total, model
 
     def evidence(self, asking: Callable | None = None) -> EvidentSolution:
-        """Return what the windows demand, solved as `calibrate_by_evidence` solves a recording; `asking` is called with the share done."""
+        """Return the solution with the supported effects, as `calibrate_by_evidence`; `asking` is called with the completed share."""
         if self.store.complete:
             return solve_by_evidence(self.solved(self.options), self.table, self.options, solve_again=self.solved, asking=asking)
         return ask_kept(self.solved(self.demand.options(self.options)), self.table, self.options, known=self.demand, asking=asking)

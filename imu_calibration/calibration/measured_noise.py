@@ -1,4 +1,4 @@
-"""Noise that was measured at rest in the place of what a calibration saw within its windows."""
+"""Noise measured at rest instead of the noise estimated within the windows of a calibration."""
 
 from dataclasses import replace
 

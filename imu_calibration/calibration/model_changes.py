@@ -1,4 +1,4 @@
-"""What a recording did to the model that was asked for: effects it demands, and effects that it was not believed."""
+"""Changes of the requested model by a recording: added effects, and effects that were found but rejected."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,12 +16,12 @@ class ModelChanges:
     """Names of effects, the strongest first."""
 
     added: tuple[str, ...] = ()
-    """Taken into the model because the recording demands them."""
+    """Added to the model because the data support them."""
     denied: tuple[str, ...] = ()
-    """Not taken in because parts of the recording disagree on them; the standard deviations allow for them."""
+    """Not added because the estimates of parts of the recording differ; the standard deviations allow for them."""
     implausible: dict[str, float] = field(default_factory=dict)
     """
-    Not taken in because their sizes are known of no instrument -> share of what the model leaves that each explains; the standard
+    Not added because no known instrument has effects of this size -> explained share of the excess variance; the standard
     deviations allow for them.
     """
     lacking: tuple[str, ...] = ()
@@ -35,32 +35,32 @@ class ModelChanges:
 
     @classmethod
     def from_mapping(cls, known: Mapping[str, Any]) -> 'ModelChanges':
-        """Return the changes that `to_mapping` told."""
+        """Return the changes from the mapping of `to_mapping`."""
         return cls(tuple(known.get('added', ())), tuple(known.get('denied', ())), dict(known.get('implausible', {})),
                    tuple(known.get('lacking', ())))
 
 
 @dataclass(frozen=True, eq=False)
 class Demand:
-    """What a recording demands of the model: all that another solution of the same windows, and more, needs to know of a search."""
+    """Effects that a recording supports: the result of a search as needed for further solutions of the same and more windows."""
 
     added: tuple[tuple[str, str], ...] = ()
-    """(sensor, effect) beyond what is asked for."""
+    """(sensor, effect) in addition to the requested ones."""
     point: dict[str, np.ndarray] = field(default_factory=dict)
-    """Effect -> values at which columns are taken first."""
+    """Effect -> values of the first linearisation."""
     changes: ModelChanges = ModelChanges()
-    """The same in words, for the document."""
+    """The same as text, for the document."""
     moves: tuple[tuple[Mapping[str, float], float], ...] = ()
-    """(parameter -> what another choice would have moved it by, weight of that choice)."""
+    """(parameter -> its change under another choice of effects, weight of that choice)."""
     clipped: Solution | None = None
-    """The solution without what a limit of a sensor spoils, where the search found one."""
+    """The solution without saturated samples if the search found a limit of a sensor."""
 
     def options(self, asked: CalibrationOptions) -> CalibrationOptions:
         """Return the options of the model that is solved."""
         return replace(asked, added=self.added, point=self.point)
 
     def disagreement(self, names: Sequence[str]) -> np.ndarray:
-        """Return the covariance of what other choices would have moved parameters by, shape (n_params, n_params)."""
+        """Return the covariance of the changes of parameters by other choices of effects, shape (n_params, n_params)."""
         total = np.zeros((len(names),) * 2)
         for moved, weight in self.moves:
             shift = np.array([moved.get(name, 0.0) for name in names])
@@ -74,17 +74,17 @@ class Demand:
 
     @property
     def is_nothing(self) -> bool:
-        """Whether a solution of what was asked for stays as it is."""
+        """Whether the solution of the requested model is unchanged."""
         return not (self.added or self.moves or self.clipped or self.changes != ModelChanges())
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return what a saved session keeps of it; the solution of a search is made anew."""
+        """Return the content that is saved with a session; the solution of a search is computed again."""
         return {'added': [list(key) for key in self.added], 'changes': self.changes.to_mapping(),
                 'moves': [[dict(moved), weight] for moved, weight in self.moves]}
 
     @classmethod
     def from_mapping(cls, known: Mapping[str, Any], point: Mapping[str, Any]) -> 'Demand':
-        """Return what `to_mapping` kept, with the point of the columns that were saved beside it."""
+        """Return the Demand from the mapping of `to_mapping`, with the separately saved point of the columns."""
         added = tuple((str(sensor), str(name)) for sensor, name in known.get('added', ()))
         return cls(added, {name: np.asarray(point[name], float) for _, name in added if name in point},
                    ModelChanges.from_mapping(known.get('changes', {})),

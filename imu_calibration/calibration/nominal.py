@@ -1,4 +1,4 @@
-"""A calibration of which one sensor is not used: its parameters as of a data sheet, and nothing that is made of its readings."""
+"""A calibration with one unused sensor: nominal parameters, and no corrections computed from its readings."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from imu_calibration.calibration.document import Calibration
 
 READINGS = {'accelerometer': {'force'}, 'gyroscope': {'rate', 'angular acceleration'}}
-"""Sensor -> what of `ColumnGroup.uses` is made of its readings when others are corrected."""
+"""Sensor -> items of `ColumnGroup.uses` that are computed from its readings to correct the other sensor."""
 
 
 def with_nominal(calibration: 'Calibration', sensors: Sequence[str]) -> 'Calibration':
     """
-    Return a calibration that leaves sensors as they come.
+    Return a calibration without correction of the given sensors.
 
     Biases and matrices of these sensors are their priors', with the priors' standard deviations, which the covariances of corrected
-    readings carry on; their further effects go, but for the limits of their range. So does what the other sensor is corrected by with their
+    readings propagate; their other effects, except range limits, are removed. So are corrections of the other sensor that use their
     readings: a g-sensitivity by the force of a refused accelerometer, lever arms by the rate of a refused gyroscope.
     """
     model = calibration.model

@@ -1,4 +1,4 @@
-"""What to estimate and how to judge it, and the model that follows from it."""
+"""Options of the estimate and of its assessment, and the model for them."""
 
 from dataclasses import dataclass, field, replace
 
@@ -18,7 +18,7 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """What to estimate and how to judge it."""
+    """Options of the estimate and of its assessment."""
 
     accelerometer_model: str | None = None
     """Named model or names joined by '+'; None: bias+matrix, and accel_size_effect when the rotation shows it."""
@@ -33,31 +33,31 @@ class CalibrationOptions:
     nominal: NominalScaling | None = None
     """For recordings in volts or counts."""
     gravity: float | None = None
-    """Local gravity where there is no table, m/s^2; None: the standard gravity, with what it may be off by."""
+    """Local gravity where there is no table, m/s^2; None: the standard gravity, with its uncertainty."""
     catalogue: Catalogue = CATALOGUE
     """The effects that there are."""
     noise: NoiseFigures | None = None
-    """The noise of this IMU at rest; None: the recording says how the biases move."""
+    """The noise of this IMU at rest; None: bias processes estimated from the recording."""
     as_asked: bool = False
-    """Whether the model is exactly what was asked for, whatever the recording says."""
+    """Whether the requested model is used unchanged, without a search of effects."""
     added: tuple[tuple[str, str], ...] = ()
     """(sensor, effect) that a recording demands on top."""
     point: dict[str, np.ndarray] = field(default_factory=dict)
-    """Effect -> values at which columns are taken first."""
+    """Effect -> values of the first linearisation."""
     gravity_sd: float = 0.0
     """Standard deviation of `gravity`, m/s^2."""
 
     @property
     def bias_processes(self) -> dict[str, tuple[BiasProcess, ...]]:
-        """Sensor -> how its bias moves, where that was measured apart."""
+        """Sensor -> its bias processes if measured separately."""
         return {} if self.noise is None else bias_processes(self.noise)
 
 
 def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
     """
-    Return the model whose columns are gathered; `settle_model` takes out what the rotation does not show.
+    Return the model of the gathered columns; `settle_model` removes the size effect if the rotation does not determine it.
 
-    With an unknown place of the mount, the size effect comes with a common `lever_arm` and the origin is the mean of the three
+    With an unknown place of the mount, the size effect includes a common `lever_arm` and the origin is the mean of the three
     sensitive points.
     """
     names = table.joint_names
@@ -74,7 +74,7 @@ def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
 
 
 def settle_model(model: SensorModel, options: CalibrationOptions, gathered: Gathered) -> SensorModel:
-    """Return the model without the size effect when nobody asked for it and the recording holds no rotation that shows it."""
+    """Return the model without the size effect if it was not requested and the recording has no rotation that determines it."""
     if options.accelerometer_model is not None:
         return model
     if gathered.accumulator.samples.get('spin', 0) + gathered.accumulator.samples.get('dynamic', 0) == 0:

@@ -4,7 +4,7 @@ import numpy as np
 
 
 class SolvePacer:
-    """Says when the next solution is due, so that solving takes no more than a share of the time."""
+    """Schedules the next solution so that solving uses at most a given share of the time."""
 
     def __init__(self, share: float):
         self._share, self._next = share, -np.inf
@@ -14,5 +14,5 @@ class SolvePacer:
         return now >= self._next
 
     def note(self, start: float, end: float) -> None:
-        """Take note of a solution that was worked on from `start` to `end`."""
+        """Record a solution that was computed from `start` to `end`."""
         self._next = start + (end - start) / self._share

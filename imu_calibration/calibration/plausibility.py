@@ -1,4 +1,4 @@
-"""Values that no instrument is known to have: what the catalogue knows of grades, held against a calibration."""
+"""Implausible values: comparison of a calibration with the grades of instruments in the catalogue."""
 
 import numpy as np
 
@@ -41,13 +41,13 @@ def beyond_instruments(calibration: Calibration, sensor: str) -> str:
 
 
 def beyond_known(share: float, section: str) -> str:
-    """Return what is said of an effect that explains a share of the rest with a size that is known of no instrument."""
+    """Return the message for an effect that explains a share of the excess variance with a size that no known instrument has."""
     return (f'explains {100 * share:.0f} % of the residual, but its size exceeds '
             f'{LOOK_FOR.get(section, "the literature values of such sensors: check saturation, the mount, the scale")}')
 
 
 def implausible(calibration: Calibration, sensor: str | None = None) -> list[str]:
-    """Return one line for each parameter group, of a sensor or of any, that lies outside what is known of any grade of instrument."""
+    """Return one line for each parameter group, of one sensor or of all, that is outside the range of all grades of instruments."""
     lines = []
     for effect in calibration.model.effects:
         if sensor not in (None, effect.sensor):

@@ -23,43 +23,43 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.reference.table import Table
 
 RESAMPLES = 1000
-"""Of whole blocks, for an interval."""
+"""Resamples of complete blocks for an interval."""
 LEAST_BLOCKS = 3
-"""Blocks below which nothing is said of a regime."""
+"""Least blocks for a result in a regime."""
 LARGEST_DELAY = 0.1
-"""A delay is looked for up to this size, s."""
+"""Largest delay of the search, s."""
 Side = tuple[HeldOut, Sequence[Sequence[np.ndarray]]]
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """What one set of parameters leaves of one sensor."""
+    """Errors of one sensor with one set of parameters."""
 
     squares: np.ndarray
     """Sum of squared errors by block and regime, shape (n_blocks, n_regimes)."""
     delay: float
-    """By how much the readings came late beside these parameters, s."""
+    """Delay of the readings in addition to these parameters, s."""
     without_delay: float
-    """Sum of squared errors if nobody asked for a delay."""
+    """Sum of squared errors without an estimate of the delay."""
 
 
 def prove_solution(held_out: HeldOut, solution: Solution, gathered_model: SensorModel, *, centre: Centre) -> dict:
     """
     Return the proof of a solution on held-out windows: sensor -> entry of a document (see `prove`).
 
-    Every fold of windows is predicted with parameters from which it was left out, as compensation applies them (`applied_values`).
+    Every fold of windows is predicted with parameters estimated without it, as compensation applies them (`applied_values`).
     The correction is linearised at the reference motion, ``true + matrix^-1 (measured - output(true))``, which the statistics of windows
     allow; it differs from that of readings by the square of the errors.
 
     Parameters
     ----------
     held_out : HeldOut
-        The windows of the solution, dealt out.
+        The windows of the solution in folds.
     solution : Solution
     gathered_model : SensorModel
-        The model whose columns were gathered.
+        The model of the gathered columns.
     centre : mapping
-        Where effects that compensation cannot undo are applied.
+        Operating point at which effects that compensation cannot undo are applied.
 
     """
     dealt, model = held_out.restricted(gathered_model, solution.model), solution.model
@@ -140,7 +140,7 @@ def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray
 
 
 def _with_reference(model, values, reference):
-    """Return the values with the table and the clock of others."""
+    """Return the values with the table and the clock of other values."""
     values = values.copy()
     for effect in model.effects:
         if _of_reference(effect):
@@ -171,7 +171,7 @@ def _errors(held_out, model, sensor, folds, regimes):
 
 
 def _nuisances(stacked):
-    """Return what makes ``error + sum(nuisance change)`` least, the delay first, and the sum of squares without a delay."""
+    """Return the nuisances that minimise ``error + sum(nuisance change)``, the delay first, and the sum of squares without a delay."""
     error, changes = stacked[0].ravel(), stacked[1:].reshape(len(stacked) - 1, -1)
     best = np.linalg.lstsq(changes.T, -error, rcond=1e-9)[0]
     others = changes[1:]
@@ -198,7 +198,7 @@ class _Correction:
     def errors(self, rows):
         """Return errors and their change with each nuisance, (1 + n_nuisances, k, 3): the delay, s, and the arm, m."""
         columns, slope, output = rows[:, :-2 * AXES], rows[:, -2 * AXES:-AXES], rows[:, -AXES:]
-        # measured(t) = matrix @ true(t - delay): what is missing is delay times the slope.
+        # measured(t) = matrix @ true(t - delay): the error is the delay times the slope.
         parts = [output - columns @ self.total, slope @ self.matrix.T, *(-columns @ arm for arm in self.arms)]
         return np.stack(parts) @ self.inverse.T
 
@@ -209,14 +209,14 @@ def _entry(before, after, count):
 
 def compared(before: np.ndarray, after: np.ndarray, count: np.ndarray, *, components: int = AXES) -> dict:
     """
-    Return {'before', 'after', 'ci95'}: rms per component, and the interval of their ratio over resamples of whole blocks.
+    Return {'before', 'after', 'ci95'}: rms per component, and the interval of their ratio over resamples of complete blocks.
 
     Parameters
     ----------
     before, after : array, shape (n_blocks,)
         Sums of squared errors.
     count : array, shape (n_blocks,)
-        How many errors each sum holds, per component.
+        Number of errors in each sum, per component.
     components : int
 
     """

@@ -9,7 +9,7 @@ from imu_calibration.effects.base import SENSORS
 
 
 class StatementKind(StrEnum):
-    """What a statement is."""
+    """Kind of a statement."""
 
     DECISION = 'decision'
     """The decision on a sensor."""
@@ -37,28 +37,28 @@ class Reason:
     """One statement about the calibration."""
 
     word: StatementKind
-    """What it is."""
+    """Its kind."""
     what: str
     """The statement."""
     next: str
-    """The next step; empty when nothing has to be done."""
+    """The next step; empty when no action is needed."""
     key: str | None = None
-    """What has to be given for it, a key of `errors.KEYS`."""
+    """The input needed for it, a key of `errors.KEYS`."""
     sensors: tuple[str, ...] = SENSORS
-    """Whose parameters it concerns."""
+    """Sensors with parameters that it concerns."""
 
 
 def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:
-    """Return kind of window -> variance of what is left of the sensor there, over that of its noise."""
+    """Return kind of window -> ratio of the residual variance of the sensor to its noise variance."""
     chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
     return {kind: ratio for kind, ratio in chi2.items() if kind != 'means'}
 
 
 def quiet(calibration: Calibration) -> str:
     """
-    Return what residuals in motion are compared with.
+    Return the name of the reference that residuals in motion are compared with.
 
-    Without a rest only their own slow part is there, and lags show in the fast one.
+    Without a rest it is their slow part; lags are visible in the fast part.
     """
     return 'the noise at rest' if rested(calibration) else 'their slow part (as after a lag or a late clock)'
 

@@ -1,4 +1,4 @@
-"""Amplitude spectral density of what a calibration leaves within moving windows: lines name causes, the floor is the noise."""
+"""Amplitude spectral density of the residuals within moving windows: lines indicate causes, the floor is the noise."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.segmentation.window import Window
 
 LONGEST = 1024
-"""Samples of a segment, at most: finer lines than a recording of a minute can tell apart say nothing."""
+"""Most samples of a segment: a finer resolution than that of a recording of a minute is not useful."""
 SHORTEST = 64
 """Windows with fewer samples are left out."""
 
@@ -23,7 +23,7 @@ def residual_spectrum(result: CalibrationResult, windows: Sequence[Window]) -> t
     Parameters
     ----------
     result : CalibrationResult
-        What predicts them.
+        The calibration that predicts them.
     windows : sequence of Window
         With their samples.
 

@@ -1,4 +1,4 @@
-"""A finished calibration with what a report needs beside it, whatever its reference was; its summary and its exit code."""
+"""A finished calibration with the data for a report, for any kind of reference; its summary and its exit code."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from imu_calibration.segmentation.window import Window
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationResult(ABC):
-    """A calibration with what a report needs beside it: on a table a `TableResult`, by hand a `by_hand.result.HandResult`."""
+    """A calibration with the data for a report: on a table a `TableResult`, by hand a `by_hand.result.HandResult`."""
 
     calibration: Calibration
     """The document's content."""
@@ -31,10 +31,10 @@ class CalibrationResult(ABC):
     needed: dict[str, tuple[str, float]]
     """Parameter that is not determined -> (the motion that would serve it best, its sd after a minute of that motion, NaN when unknown)."""
     options: CalibrationOptions = CalibrationOptions()
-    """What was asked for."""
+    """Options of the requested model."""
 
     observations: ClassVar[str]
-    """What the data consist of: 'windows' or 'poses'."""
+    """Unit of the data: 'windows' or 'poses'."""
 
     @property
     def verdict(self) -> Verdict:
@@ -45,7 +45,7 @@ class CalibrationResult(ABC):
     @property
     @abstractmethod
     def reference(self) -> str:
-        """What the sensor was compared with, in a few words."""
+        """Short description of the reference of the sensor."""
 
     @property
     @abstractmethod
@@ -81,7 +81,7 @@ class CalibrationResult(ABC):
 
 def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> tuple[str, list[str]]:
     """
-    Return (the more cautious decision, lines for people: decisions, parameters, warnings, notes and next steps).
+    Return (the more cautious decision, lines for the user: decisions, parameters, warnings, notes and next steps).
 
     `hints` as for `errors.with_hint`.
     """
@@ -90,7 +90,7 @@ def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> t
 
 
 def exit_code(calibration: Calibration) -> int:
-    """Return 0 when each sensor helps, every requested parameter is determined and nothing was lost, else 3."""
+    """Return 0 when each sensor helps, every requested parameter is determined and no data were lost, else 3."""
     harmful = most_cautious(calibration.decisions.values()) is not HELPS
     lacking = harmful or any(status != DETERMINED for status in calibration.requested.values())
     return 3 if lacking or calibration.statistics.get('dropped') or calibration.statistics.get('unusable') else 0

@@ -1,4 +1,4 @@
-"""What everybody may ask of a calibration that goes on, whatever its reference: on a table `calibration.live`, by hand `by_hand.live`."""
+"""Common interface of live calibrations: on a table `calibration.live`, by hand `by_hand.live`."""
 
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -19,28 +19,28 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 
 @dataclass(frozen=True)
 class SessionStatus:
-    """How far a session has come, for people."""
+    """Progress of a session, for the user."""
 
     word: Progress
     """WAITING before a solution is possible, WEAK while something is missing, or DETERMINED."""
     message: str
-    """One line: what there is, and what to do next."""
+    """One line: the present state and the next step."""
     values: dict[str, Any] = field(default_factory=dict)
     """Figures by name."""
 
 
 class TableSession(Protocol):
-    """What is asked of a session on a table only."""
+    """Interface of a session on a table only."""
 
     table: Table
     """The reference."""
     options: CalibrationOptions
-    """What is estimated."""
+    """Options of the estimate."""
     last: LiveSnapshot | None
-    """What the last solution was made of."""
+    """The data of the last solution."""
 
     def adopt(self, demand: Demand) -> bool:
-        """Take what the session demands into the model from now on; return whether anything changes."""
+        """Add the effects that the session supports to the model from now on; return whether the model changes."""
 
     @property
     def result(self) -> TableResult | None:
@@ -48,12 +48,12 @@ class TableSession(Protocol):
 
 
 class LiveSession(Protocol):
-    """A calibration while the motion goes on: `push` what arrives, `solve` when it is due."""
+    """A calibration during the motion: `push` for new blocks, `solve` when it is due."""
 
     settings: LiveSettings
-    """How often to solve, and what is kept and told; may be replaced."""
+    """Solving interval, storage and published data; may be replaced."""
     observations: str
-    """What is gathered, for people: 'windows' or 'poses'."""
+    """Unit of the gathered data, for the user: 'windows' or 'poses'."""
     needs_joints: bool
     """Whether it waits for joint states."""
 
@@ -63,7 +63,7 @@ class LiveSession(Protocol):
 
     @property
     def on_table(self) -> TableSession | None:
-        """The session itself where a table is the reference, as a diagnosis asks for it; None by hand."""
+        """The session itself if a table is the reference, for a diagnosis; None by hand."""
 
     @property
     def needs_temperature(self) -> bool:
@@ -79,38 +79,38 @@ class LiveSession(Protocol):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Samples by what became of them."""
+        """Samples by their use."""
 
     @property
     def stamping(self) -> StampLine | None:
         """How the stamps of the IMU are; None while that is not known."""
 
     def push(self, block: SampleBlock) -> list:
-        """Take what arrived and return the windows or poses that it completed."""
+        """Process a block and return the windows or poses that it completed."""
 
     def residuals(self, completed: list) -> ImuSamples | None:
-        """Return measured minus predicted of what `push` returned, or None before the first solution."""
+        """Return measured minus predicted values of the windows or poses from `push`, or None before the first solution."""
 
     def solve(self, pending: bool = False, provenance: dict | None = None) -> CalibrationResult:
-        """Solve what was gathered; with `pending`, count in what would be there if the motion ended now."""
+        """Solve the gathered data; with `pending`, include open windows or poses as if the motion ended now."""
 
     def needs_linearising(self) -> bool:
-        """Return whether the answer is not final because what it needs is no longer kept."""
+        """Return whether the result is not final because data for another linearisation are no longer kept."""
 
     def saved(self, pending: bool = False) -> bytes:
-        """Return what was gathered as bytes, for another run."""
+        """Return the gathered data as bytes, for another run."""
 
     def groups(self) -> list[GroupState]:
-        """Return what is known of each effect."""
+        """Return the state of each effect."""
 
     def status(self, hints: dict[str, str] | None = None) -> SessionStatus | None:
-        """Return how far the session has come beyond what `groups` tell, or None; `hints` as for `errors.with_hint`."""
+        """Return the progress of the session in addition to `groups`, or None; `hints` as for `errors.with_hint`."""
 
     def coverage(self) -> Coverage:
-        """Return which attitudes are worth having, and what to do next."""
+        """Return the gain of further attitudes, and the next step."""
 
     def change_windows(self, windows: WindowSettings) -> None:
         """Find windows or poses by other settings from now on."""
 
     def change_by_hand(self, by_hand: LiveByHandSettings) -> None:
-        """Take what counts where no table is the reference."""
+        """Apply the settings of a calibration by hand."""

@@ -1,4 +1,4 @@
-"""A calibration for people: every parameter with its standard deviation, in their units, and the decision per sensor."""
+"""A calibration as text: every parameter with its standard deviation, in common units, and the decision per sensor."""
 
 from collections.abc import Iterator
 from html import escape

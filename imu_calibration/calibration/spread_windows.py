@@ -3,21 +3,21 @@
 from imu_calibration.segmentation.window import Window
 
 MOST_SAMPLES = 100_000
-"""Samples kept; beyond it every second window of each kind goes."""
+"""Most samples kept; beyond it every second window of each kind is removed."""
 
 
 class SpreadWindows:
     """
     Every so many-th window of each kind, so that memory and the time of a search are bounded.
 
-    Which ones depends on the recording alone.
+    The selection depends only on the recording.
     """
 
     def __init__(self) -> None:
         self.n_samples, self._stride, self._counts, self._kept = 0, 1, {}, []
 
     def add(self, window: Window) -> None:
-        """Take a window in order of time, in memory of its own (`owned_window`)."""
+        """Add a window in order of time, as a copy in separate memory (`owned_window`)."""
         number = self._counts[window.kind] = self._counts.get(window.kind, -1) + 1
         if number % self._stride:
             return
@@ -29,7 +29,7 @@ class SpreadWindows:
             self.n_samples = sum(len(window.time) for _, window in self._kept)
 
     def copy(self) -> 'SpreadWindows':
-        """Return one that goes its own way; the windows are shared."""
+        """Return an independent copy; the windows are shared."""
         twin = SpreadWindows()
         twin.n_samples, twin._stride, twin._counts, twin._kept = self.n_samples, self._stride, dict(self._counts), list(self._kept)
         return twin

@@ -1,4 +1,4 @@
-"""How well a recording knows a parameter, and how well it must."""
+"""Uncertainty of a parameter in relation to its tolerance."""
 
 from collections.abc import Collection, Iterable
 from enum import StrEnum
@@ -9,14 +9,14 @@ from imu_calibration.effects.sensor_model import SensorModel
 
 
 class Status(StrEnum):
-    """Status of a parameter; a document holds the word."""
+    """Status of a parameter; stored as text in a document."""
 
     DETERMINED = 'determined'
     """Its standard deviation is within the tolerance."""
     WEAK = 'weak'
     """It is not, but value and standard deviation are honest."""
     HELD = 'held'
-    """The recording says next to nothing: both are the prior's."""
+    """Not determined by the recording: value and sd are those of the prior."""
 
 
 DETERMINED, WEAK, HELD = Status
@@ -36,7 +36,7 @@ def statuses(sd: Iterable[float], held: Iterable[bool], tolerances: Iterable[flo
     sd : array_like, shape (n_params,)
         Standard deviations, SI.
     held : array_like of bool, shape (n_params,)
-        Whether the prior stands.
+        Whether the parameter is fixed at its prior.
     tolerances : array_like, shape (n_params,)
         Largest standard deviation of a determined parameter, SI.
 

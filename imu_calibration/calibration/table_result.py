@@ -20,7 +20,7 @@ from imu_calibration.segmentation.window import Window
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TableResult(CalibrationResult):
-    """A calibration on a table with what a report needs beside it."""
+    """A calibration on a table with the data for a report."""
 
     solution: Solution
     """Parameters with noise and residuals."""
@@ -29,7 +29,7 @@ class TableResult(CalibrationResult):
     model: SensorModel
     """The model that was solved."""
     gathered_model: SensorModel
-    """The model whose columns were gathered; it may have more effects."""
+    """The model of the gathered columns; it may have more effects."""
 
     observations: ClassVar[str] = 'windows'
 
@@ -75,11 +75,11 @@ class TableResult(CalibrationResult):
         return WindowErrors(found['time'], kind, **parts)
 
     def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
-        """Return measured minus what the motion of the table predicts."""
+        """Return measured values minus those predicted from the motion of the table."""
         predicted = predict(self.solution.model, self.solution.values, self.table, motion=window.motion, temperature_c=window.temperature_c)
         return {sensor: measured - model for sensor, measured,
                 model in zip(SENSORS, (window.force_s, window.rate_s), predicted, strict=True)}
 
     def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
-        """Return noise beside what the table contributes."""
+        """Return the contributions of the noise and of the table."""
         return error_budget(self, errors)

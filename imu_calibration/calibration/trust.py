@@ -1,4 +1,4 @@
-"""What of a calibration is applied: the decision per sensor, and consent of the user."""
+"""Applied parts of a calibration: the decision per sensor, and consent of the user."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -93,7 +93,7 @@ def _text(calibration, sensor):
 
 
 def usage(calibration: Calibration) -> str:
-    """Return which sensor compensation corrects where it corrects one alone, a line; '' otherwise."""
+    """Return a line with the sensor that is corrected if only one is; '' otherwise."""
     refused = refused_sensors(calibration)
     if len(refused) != 1:
         return 'compensation corrects neither sensor with it' if refused else ''
@@ -102,7 +102,7 @@ def usage(calibration: Calibration) -> str:
 
 
 def caveats(calibration: Calibration) -> list[str]:
-    """Return what a user of the calibration should know in addition to the decisions, a line each."""
+    """Return the caveats for a user of the calibration in addition to the decisions, a line each."""
     return uncorrected_lines(calibration.statistics) + ([text] if (text := missing(calibration)) else [])
 
 
@@ -113,5 +113,5 @@ def missing(calibration: Calibration) -> str:
 
 
 def standing(calibration: Calibration) -> str:
-    """Return the decisions in a few words, for one line in a log."""
+    """Return the decisions in short, for one line in a log."""
     return decisions_text(calibration.decisions)

@@ -21,7 +21,7 @@ LAST_SHARE = 2.0 / 3.0
 
 @dataclass(frozen=True, eq=False)
 class Uncorrected:
-    """What compensation applies instead of effects that it cannot undo."""
+    """Constant values that compensation applies instead of effects that it cannot undo."""
 
     centre: Centre = field(default_factory=dict)
     """Column group -> values of its columns at which the effect is applied."""
@@ -35,7 +35,7 @@ class Uncorrected:
 
 def uncorrected_on_table(model: SensorModel, values: np.ndarray, accumulator: Accumulator, *, gathered: SensorModel) -> Uncorrected:
     """
-    Return what a calibration on a table leaves uncorrected.
+    Return the errors that remain uncorrected by a calibration on a table.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def uncorrected_on_table(model: SensorModel, values: np.ndarray, accumulator: Ac
 
 def uncorrected_in_time(model: SensorModel, values: np.ndarray, times: Sequence[float] | np.ndarray, *,
                         end: float) -> Uncorrected:
-    """Return what remains uncorrected of effects in time at some `times`, s, of a recording that ends at `end`."""
+    """Return the uncorrected part of effects in time at `times`, s, of a recording that ends at `end`."""
     centre, sizes = {}, []
     for effect in not_applied(model):
         at_end, at_times = columns_at(model, effect, [end]), columns_at(model, effect, times)

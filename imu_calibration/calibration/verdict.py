@@ -90,7 +90,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
 
     The decision follows from the proof (`decision.decide`); `helps` without rests and with large residuals becomes `unproven`. Warnings are
     values beyond any known instrument, residuals in motion far above the noise at rest, known causes that are not in the model, and a
-    sensor that the recording does not determine at all.
+    sensor without any determined parameter.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def _whose(sections):
 
 
 def _strange_causes(calibration):
-    """Return reasons why a cause that is known stays out of the model."""
+    """Return reasons why a known cause is not in the model."""
     found = calibration.statistics.get('implausible') or {}
     catalogue = {effect.name: effect.sensor for effect in calibration.model.catalogue.effects(calibration.model.joint_names).values()}
     return [Reason(WARNING, f'{name} {beyond_known(share, catalogue.get(name, ""))}; '

@@ -11,7 +11,7 @@ from imu_calibration.segmentation.window import UnusedReason
 from imu_calibration.units import for_people, significant
 
 LOST_SHARE = 0.05
-"""Losing more than this share of the samples is worth a look at the recording."""
+"""A warning is issued when more than this share of the samples is lost."""
 
 
 def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
@@ -27,7 +27,7 @@ def _worse(calibration):
 
 
 def _unused_rests(calibration):
-    """Return a warning about rests without any static window: noise and sds are then estimated from motion alone."""
+    """Return a warning about rests without any static window: noise and sds are then estimated only from motion."""
     counts = calibration.statistics.get('stream') or {}
     unused = {reason: counts.get(reason, 0) for reason in (UnusedReason.REST_TOO_SHORT, UnusedReason.NOT_QUIET)}
     total, used = sum(unused.values()), sum((calibration.statistics.get('samples_used') or {}).values())
@@ -40,7 +40,7 @@ def _unused_rests(calibration):
 
 
 def _adopted(calibration):
-    """Return notes on what the recording did to the model."""
+    """Return notes on the changes of the model by the recording."""
     added, denied = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
     notes = [Reason(NOTE, 'added to the model, because the recording demands it: '
                     f'{", ".join(_with_size(calibration, name) for name in added)}',
@@ -64,7 +64,7 @@ def _strange(values):
 
 
 def _with_size(calibration, name):
-    """Return an effect with its plainest parameter, in units that people use."""
+    """Return an effect with its most significant parameter, in common units."""
     effect = next((effect for effect in calibration.model.effects if effect.name == name), None)
     if effect is None:
         return name
@@ -97,7 +97,7 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
 
 
 def _left_out(calibration):
-    """Return notes on windows that the others contradict."""
+    """Return notes on windows that are inconsistent with the remaining windows."""
     notes = []
     for sensor in SENSORS:
         times = (calibration.statistics.get(sensor) or {}).get('left_out_s') or []

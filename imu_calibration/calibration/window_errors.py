@@ -1,4 +1,4 @@
-"""Errors of window means before and after calibration: what most of the report is drawn from."""
+"""Errors of window means before and after calibration: the data of most figures of the report."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class WindowErrors:
-    """One row per window; errors are what the sensor reads beyond the truth, in SI."""
+    """One row per window; errors are readings minus true values, in SI."""
 
     time: np.ndarray
     """Middle of the window, s, shape (n,)."""
@@ -30,7 +30,7 @@ class WindowErrors:
     after: dict
     """Sensor -> error of the corrected mean, shape (n, 3)."""
     floor: dict
-    """Sensor -> what noise alone leaves in the mean, one sd, shape (n, 3)."""
+    """Sensor -> sd of the mean from noise, shape (n, 3)."""
 
     def rms(self, sensor: str, which: str, kind: str | None = None) -> float:
         """Return the root mean square error of 'before' or 'after', over windows of one kind or all."""
@@ -40,7 +40,7 @@ class WindowErrors:
 
 def window_residuals(result: 'TableResult') -> dict:
     """
-    Return residuals per window before and after: what a nominal sensor would show, and what the model leaves.
+    Return residuals per window before and after calibration: those of a nominal sensor, and those of the model.
 
     Returns
     -------
