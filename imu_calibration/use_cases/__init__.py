@@ -1,5 +1,5 @@
 """
-What people do, from files to files: the command line, notebooks and scripts call the same functions.
+Tasks of the user, from files to files: the command line, notebooks and scripts call the same functions.
 
 In: paths of recordings and tables, choices by name. Out: results that print, draw and save themselves.
 Read `calibrate` first.

@@ -28,14 +28,14 @@ from imu_calibration.use_cases.stand import Stand, table_of
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """What calibrating gave: prints the parameters and the verdict, draws residuals, saves calibration.yaml and report.html."""
+    """Result of a calibration: prints the parameters and the verdict, draws residuals, saves calibration.yaml and report.html."""
 
     result: CalibrationResult
-    """The calibration with everything that a report needs."""
+    """The calibration with all data of a report."""
 
     @property
     def calibration(self) -> Calibration:
-        """The calibration: compensates arrays, and is what `save` writes."""
+        """The calibration: compensates arrays; `save` writes it."""
         return self.result.calibration
 
     @property
@@ -45,7 +45,7 @@ class Calibrated:
 
     @property
     def exit_code(self) -> int:
-        """0 when each sensor helps, every requested parameter is determined and nothing was lost, else 3."""
+        """0 when each sensor helps, every requested parameter is determined and no message was lost, otherwise 3."""
         return exit_code(self.calibration)
 
     def plot(self, sensor: str = 'accelerometer') -> Drawing:
@@ -89,7 +89,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
     recordings : path-like, SampleBlock, or a sequence of them
         Bags, or samples in memory.
     table : path-like, Table or Arm, optional
-        The reference: a table description, a robot description (.urdf, .xacro), or what was read of them; without it gravity is: poses
+        The reference: a table description, a robot description (.urdf, .xacro), or their content; without it gravity: poses
         held still and the turns between them.
     jobs : int or None
         Recordings that are read side by side, in processes; None: one per processor.
@@ -101,7 +101,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
     Raises
     ------
     ImuCalibrationError
-        When a recording cannot be used, or nothing can be determined from it.
+        When a recording cannot be used, or no parameter can be determined from it.
 
     """
     check_names(choices)
@@ -119,7 +119,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
             open_bag(path, topics, want_joints=joints is not None).close()
     jobs = jobs_for(jobs, len(recordings))
     sources = [source_of(item, topics, joints) for item in recordings]
-    with ThreadPoolExecutor(1) as hashing:   # reads the files beside the work, not before it
+    with ThreadPoolExecutor(1) as hashing:   # reads the files during the calibration, not before it
         provenance = hashing.submit(provenance_with, 'calibrate', recordings, given, stand=stand)
         if table is None:
             result = calibrate_without_table(sources, options)
@@ -132,7 +132,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
 
 
 def _beside(result, proof):
-    """Return the result with what an earlier calibration leaves of the same errors in its proof."""
+    """Return the result with the error after an earlier calibration, from `proof`, in its own proof."""
     known = {sensor: found | ({'earlier': {name: proof[sensor][name] for name in ('after', 'ci95')}} if sensor in proof else {})
              for sensor, found in result.calibration.proof.items()}
     return replace(result, calibration=judged(replace(result.calibration, proof=known), result.tolerances))

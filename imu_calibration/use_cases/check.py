@@ -1,4 +1,4 @@
-"""From a recording and a calibration to the answer whether it helps there."""
+"""Test whether a calibration reduces the errors of a recording."""
 
 from dataclasses import dataclass
 from os import PathLike
@@ -17,16 +17,16 @@ from imu_calibration.use_cases.stand import Stand, table_of
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """What checking gave: prints the answer."""
+    """Result of a check: prints the decision."""
 
     result: CheckResult
     """The proof."""
     notes: tuple[str, ...] = ()
-    """What should be known beside it."""
+    """Notes on the result."""
 
     @property
     def proof(self) -> dict:
-        """Sensor -> error before and after, interval of their ratio, on how much, by what the IMU does."""
+        """Sensor -> error before and after, interval of their ratio, amount of data, by kind of motion."""
         return self.result.proof
 
     @property
@@ -36,7 +36,7 @@ class Checked:
 
     @property
     def exit_code(self) -> int:
-        """0 where the decision on each sensor is `helps`, else 3."""
+        """0 where the decision on each sensor is `helps`, otherwise 3."""
         return 0 if self.helps else 3
 
     def __str__(self):
@@ -50,7 +50,7 @@ class Checked:
 def check(recording: str | PathLike | SampleBlock, calibration: Calibration | str | PathLike, table: Stand | None = None,
           **choices: Unpack[Choices]) -> Checked:
     """
-    Say whether a calibration helps on a recording: the error before and after, by sensor and by what the IMU does.
+    Test whether a calibration helps on a recording: the error before and after, by sensor and kind of motion.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def check(recording: str | PathLike | SampleBlock, calibration: Calibration | st
         The reference of this recording; it need not be the one of the calibration. Without it gravity is: the IMU held still in some
         attitudes, and the turns between them.
     choices
-        See `Choices`; those of topics and windows count, and the local gravity.
+        See `Choices`; the topics, the window settings and the local gravity apply.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def check(recording: str | PathLike | SampleBlock, calibration: Calibration | st
 
 
 def _gravity(options, calibration):
-    """Return a note on the gravity that was taken, when none was given."""
+    """Return a note on the gravity used, when none was given."""
     if options.gravity:
         return ()
     taken = gravity_of(calibration, options)

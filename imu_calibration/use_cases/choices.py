@@ -1,4 +1,4 @@
-"""What somebody may choose when a recording is calibrated or diagnosed: by name, each with a default."""
+"""Options for the calibration or diagnosis of a recording: by name, each with a default."""
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
@@ -19,14 +19,14 @@ from imu_calibration.use_cases.recordings import Topics
 
 
 class Choices(TypedDict, total=False):
-    """Everything has a default."""
+    """All options have defaults."""
 
     imu_topic: str | None
-    """sensor_msgs/Imu; default /imu/data_raw, else the only one."""
+    """sensor_msgs/Imu; default /imu/data_raw, otherwise the only one."""
     joint_topic: str | None
-    """sensor_msgs/JointState; default /joint_states, else the only one."""
+    """sensor_msgs/JointState; default /joint_states, otherwise the only one."""
     temperature_topic: str | None
-    """sensor_msgs/Temperature; default /imu/temperature, else the only one."""
+    """sensor_msgs/Temperature; default /imu/temperature, otherwise the only one."""
     frame_id: str | None
     """frame_id of the Imu messages; required if a topic has messages of several."""
     accelerometer_model: str | None
@@ -42,15 +42,15 @@ class Choices(TypedDict, total=False):
     height: float | None
     """Height above the ellipsoid, m; default 0."""
     model_as_asked: bool
-    """Whether nothing is added to the model whatever the recording demands; default no."""
+    """Whether the model is used without additions, even where the data support them; default no."""
     tolerances: str | PathLike | Mapping | None
     """File or {section: {effect: standard deviation up to which it counts as determined}}; default config/tolerances.yaml."""
     nominal: str | PathLike | NominalScaling | None
     """File or scaling of recordings in volts or counts."""
     noise: str | PathLike | NoiseFigures | None
-    """noise.yaml of this IMU: how its biases move, instead of what the recording says of it; needs a table."""
+    """noise.yaml of this IMU: its bias instability, in place of the estimate from the recording; needs a table."""
     catalogue: Catalogue | str | PathLike | Mapping | None
-    """The effects that there are, or what adds to them: a file with `effects`, or {name: definition}; default the package's own."""
+    """Effects added to the package's, or their complete catalogue: a file with `effects`, or {name: definition}; default the package's."""
     setting: Sequence[str] | Mapping[str, float]
     """How windows are found: 'NAME=NUMBER', ..., or {name: number}."""
     serial: str | None
@@ -73,7 +73,7 @@ def topics_of(choices: Mapping[str, Any]) -> Topics:
 
 
 def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
-    """Return what to estimate and how to judge it."""
+    """Return the options of estimation and validation."""
     catalogue = catalogue_of(choices.get('catalogue'))
     tolerances = choices.get('tolerances') or config_file('tolerances.yaml')
     read = checked_tolerances if isinstance(tolerances, Mapping) else files.read_tolerances
@@ -94,7 +94,7 @@ def catalogue_of(chosen: Catalogue | str | PathLike | Mapping | None) -> Catalog
 
 
 def window_settings(chosen: Sequence[str] | Mapping[str, float]) -> WindowSettings:
-    """Return the window settings with those that were chosen."""
+    """Return the window settings with the given options."""
     if isinstance(chosen, Mapping):
         return override(WindowSettings(), chosen)
     values = {}

@@ -22,14 +22,14 @@ CORRECTED_TOPIC = '/imu/data_corrected'
 
 @dataclass(frozen=True, eq=False)
 class Compensated:
-    """What compensating gave."""
+    """Result of a compensation."""
 
     imu: ImuSamples | None
     """The corrected samples, NaN where a reading cannot be corrected; None when they were written into a bag."""
     count: int
     """Samples that passed."""
     warnings: list[str]
-    """What speaks against the calibration, was outside its conditions, or could not be corrected, a line each."""
+    """Caveats of the calibration, readings outside its conditions, and uncorrected readings, a line each."""
     lost: dict[str, int]
     """Reason -> messages that could not be read."""
     refused: dict[str, str] = field(default_factory=dict)
@@ -52,7 +52,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
                anyway: bool = False, noise: NoiseFigures | str | PathLike | None = None, imu_topic: str | None = None,
                temperature_topic: str | None = None, frame_id: str | None = None) -> Compensated:
     """
-    Take the calibrated errors out of a recording.
+    Correct the calibrated errors in a recording.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
         A bag, or samples in memory (a block may bring temperatures).
     calibration : Calibration or path-like
     output : path-like, optional
-        A rosbag2 folder to make: all topics of the recording, and the corrected one beside them. Without it the corrected samples are
+        A rosbag2 folder to make: all topics of the recording, and the corrected one. Without it the corrected samples are
         returned.
     corrected_topic : str
         Name of the topic to add.
@@ -81,7 +81,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
     Raises
     ------
     ImuCalibrationError
-        When nobody should be corrected with the calibration, the recording is corrected already or lacks temperatures that are needed, or
+        When the calibration is not fit for correction, the recording is corrected already or lacks required temperatures, or
         the output exists.
 
     """

@@ -1,4 +1,4 @@
-"""From a recording to what the model gets wrong, why, and the extended model."""
+"""From a recording to the model errors, their causes, and the extended model."""
 
 import json
 from dataclasses import dataclass
@@ -21,24 +21,24 @@ from imu_calibration.use_cases.stand import Stand, table_of
 
 @dataclass(frozen=True, eq=False)
 class Diagnosed:
-    """What diagnosing gave: prints the findings, draws them, saves diagnosis.json, the extended calibration.yaml and report.html."""
+    """Result of a diagnosis: prints the findings, draws them, saves diagnosis.json, the extended calibration.yaml and report.html."""
 
     result: DiagnosisResult
-    """The diagnosis with everything that a report needs."""
+    """The diagnosis with all data of a report."""
 
     @property
     def calibration(self) -> Calibration:
-        """The extended calibration; the baseline's when nothing was found."""
+        """The extended calibration; the baseline's without findings."""
         return self.result.calibration
 
     @property
     def proposed(self) -> Calibration | None:
-        """The calibration with the formulas that are proposed for what stays unexplained; None where there are none."""
+        """The calibration with the formulas proposed for unexplained residuals; None where there are none."""
         return self.result.proposed
 
     @property
     def findings(self) -> tuple:
-        """What the model lacked, the strongest first."""
+        """Effects missing from the model, the strongest first."""
         return self.result.diagnosis.findings
 
     @property
@@ -48,7 +48,7 @@ class Diagnosed:
 
     @property
     def exit_code(self) -> int:
-        """0 when every requested parameter is determined and nothing was lost, else 3."""
+        """0 when every requested parameter is determined and no message was lost, otherwise 3."""
         return exit_code(self.calibration)
 
     def plot(self, number: int = 1) -> Drawing:
@@ -86,7 +86,7 @@ class Diagnosed:
 
 def diagnose(recording: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]) -> Diagnosed:
     """
-    Say what the model gets wrong on a recording and why, and extend it.
+    Find the model errors on a recording and their causes, and extend the model.
 
     Parameters
     ----------
@@ -95,12 +95,12 @@ def diagnose(recording: str | PathLike | SampleBlock, table: Stand | None = None
     table : path-like or Table, optional
         The reference; without it gravity is.
     choices
-        See `Choices`; the models are what the diagnosis starts from, by default bias and matrix alone.
+        See `Choices`; the models are the initial models of the diagnosis, by default only bias and matrix.
 
     Raises
     ------
     ImuCalibrationError
-        When the recording cannot be used, or nothing can be determined from it.
+        When the recording cannot be used, or no parameter can be determined from it.
 
     """
     check_names(choices)

@@ -30,7 +30,7 @@ class Drawing:
         return f'<div style="max-width:860px">{self.svg}</div>'
 
     def save(self, path: str | PathLike) -> None:
-        """Write the figure: as PDF if the name ends with .pdf, else as SVG."""
+        """Write the figure: as PDF if the name ends with .pdf, otherwise as SVG."""
         if Path(path).suffix.lower() == '.pdf':
             files.write_whole(path, self.svg.pdf)
         else:

@@ -29,7 +29,7 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
     to : str
         Name of the target, as `exports.registry.all_targets` lists them.
     output : path-like, optional
-        The file; None: nothing is written.
+        The file; None: no file is written.
     noise : path-like, optional
         A noise document.
     rate : float, optional
@@ -37,7 +37,7 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
     bag : path-like, optional
         Recording on which the loss is measured; default `exports.motion.standard_motion`.
     stand : path-like, Table or Arm, optional
-        What says how the recording truly moved; default its compensated readings.
+        Reference of the true motion of the recording; default its compensated readings.
     topics : Topics
         Of the bag.
     anyway : bool
@@ -46,7 +46,7 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
     Raises
     ------
     ImuCalibrationError
-        When a file cannot be read or written, nobody should be corrected with the calibration, or the target needs what is not there.
+        When a file cannot be read or written, the calibration is not fit for correction, or data that the target needs are missing.
 
     """
     target = find_target(to)
@@ -60,7 +60,7 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
 
 
 def _motion(calibration, bag, stand, topics) -> TrialMotion:
-    """Return the motion of a recording: as the table says it, else as its compensated readings say it."""
+    """Return the motion of a recording: from the table, otherwise from its compensated readings."""
     temperature = temperatures(bag, topics)
     if stand is None:
         blocks = [block.imu for block in source_of(bag, topics)() if block.imu is not None]
@@ -84,7 +84,7 @@ def import_calibration(path: str | PathLike, source: str, *, output: str | PathL
     source : str
         Name of the program, as in `export_calibration`.
     output : path-like, optional
-        calibration.yaml to write; None: nothing is written.
+        calibration.yaml to write; None: no file is written.
     frame_id : str
         Frame of the Imu messages.
 

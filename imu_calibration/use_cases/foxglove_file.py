@@ -1,4 +1,4 @@
-"""MCAP as Foxglove wants it: a schema for every topic, the sphere as a SceneUpdate; only foxglove_server knows foxglove-sdk beside it."""
+"""MCAP for Foxglove: a schema for every topic, the sphere as a SceneUpdate; only this module and foxglove_server use foxglove-sdk."""
 
 from collections.abc import Mapping
 from io import BytesIO
@@ -36,7 +36,7 @@ def foxglove() -> Any:
 
 def foxglove_bytes(contents: Mapping[str, dict[str, Any]], coverage: Coverage | None, frame_id: str, *, seconds: float = 0.0) -> bytes:
     """
-    Return an MCAP that holds the same at its beginning and at its end: it is there wherever somebody looks.
+    Return an MCAP with the same messages at its beginning and at its end: they are visible at any playback time.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def channel_of(sdk: Any, topic: str, context: Any) -> Any:
 
 
 def scene_of(coverage: Coverage, frame_id: str) -> Any:
-    """Return the sphere as a SceneUpdate: the cells, what has been up, the next motion, the arms, the line of text."""
+    """Return the sphere as a SceneUpdate: the cells, earlier up directions, the next motion, the arms, the line of text."""
     found = foxglove().messages
 
     def color(rgb, alpha=0.9):

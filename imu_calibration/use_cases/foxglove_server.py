@@ -1,4 +1,4 @@
-"""What a running node shows to Foxglove over a websocket: made by a thread of its own, and only while somebody looks."""
+"""View of a running node in Foxglove over a websocket: made in a separate thread, and only while a client is connected."""
 
 import threading
 import time
@@ -10,11 +10,11 @@ from imu_calibration.errors import InputError, shortened
 from imu_calibration.use_cases.foxglove_file import channel_of, foxglove
 
 PERIOD = 0.1
-"""Seconds between two looks at what is new and who looks."""
+"""Seconds between two checks for new content and for clients."""
 AGAIN = 1.0
-"""Seconds after which what still holds is sent again, for whoever came later: a websocket keeps nothing."""
+"""Seconds after which valid content is sent again, for later clients: a websocket stores no messages."""
 MOST_STRETCHES = 40
-"""Stretches of a stream that wait at most, the oldest go first; ten seconds of quarters."""
+"""Largest number of queued stretches of a stream, the oldest are dropped first; ten seconds of quarters."""
 
 Make = Callable[[], Any]
 Rows = Callable[[], Iterable[tuple[int, Any]]]
@@ -22,15 +22,15 @@ Rows = Callable[[], Iterable[tuple[int, Any]]]
 
 class FoxgloveServer(threading.Thread):
     """
-    A websocket server that sends what was shown last to everybody who subscribes.
+    A websocket server that sends the last content of each topic to every subscriber.
 
-    What is shown comes as functions that make it: nobody waits for them, and none is called while nobody looks. The callbacks of
-    foxglove-sdk are not used: they are called under a lock that its channels take as well.
+    Content is given as functions that make it: callers do not wait for them, and none runs without a client. The callbacks of
+    foxglove-sdk are not used: they are called under a lock that its channels acquire as well.
 
     Parameters
     ----------
     name : str
-        What Foxglove calls it.
+        Name in Foxglove.
     host : str
         Address to listen on.
     port : int
@@ -38,14 +38,14 @@ class FoxgloveServer(threading.Thread):
     topics : sequence of str
         Of `view_messages`.
     clock : callable
-        Time of what has no time of its own, ns.
+        Time of content without a time, ns.
     complain : callable
         Called with a line when something cannot be shown.
 
     Raises
     ------
     InputError
-        When foxglove-sdk is not installed, or nobody can listen there.
+        When foxglove-sdk is not installed, or the address cannot be used.
 
     """
 
@@ -68,20 +68,20 @@ class FoxgloveServer(threading.Thread):
         self.start()
 
     def show(self, topic: str, make: Make) -> None:
-        """Show what `make` returns, in place of what was shown of the topic before."""
+        """Show the result of `make` in place of the topic's earlier content."""
         self._news[topic] = make
 
     def add(self, topic: str, make: Rows) -> None:
-        """Send the messages that `make` yields, each (time in ns, content), after those of the topic before."""
+        """Send the messages that `make` yields, each (time in ns, content), after the topic's earlier ones."""
         self._streams[topic].append(make)
 
     def run(self) -> None:
-        """Send what is new, until `close`."""
+        """Send new content, until `close`."""
         while not self._ending.wait(PERIOD):
             for topic, channel in self._channels.items():
                 try:
                     self._send(topic, channel)
-                except Exception as error:   # a picture that fails must not end what it shows
+                except Exception as error:   # a failed view must not end its node
                     self._complain(f'{topic} cannot be shown: {shortened(f"{type(error).__name__}: {error}", 200)}')
 
     def _send(self, topic, channel):

@@ -1,4 +1,4 @@
-"""Inspect: what the topics of a recording hold, what looks wrong with them, and what they can determine; each is read through once."""
+"""Inspect: content of the topics of a recording, their faults, and the parameters that they determine; each is read once."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -25,30 +25,30 @@ from msg_adapters.bag import Recording, imu_topics, list_topics
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What one Imu topic of a recording is like, with the joints and temperatures that go with it."""
+    """Properties of one Imu topic of a recording, with the joints and temperatures used with it."""
 
     recording: Recording
     """The recording, closed again."""
     streams: dict[str, StreamStatistics]
-    """'imu', 'joints' or 'temperature' -> what its stamps are like."""
+    """'imu', 'joints' or 'temperature' -> statistics of its stamps."""
     findings: tuple[CheckFinding, ...]
-    """What looks wrong."""
+    """Detected faults."""
     lost: dict[str, int]
     """Reason -> messages that could not be read."""
     calibrated: TableResult | ImuCalibrationError | None
-    """What the motions determine, or why nothing; None without a table."""
+    """Result of a calibration on the motions, or the error; None without a table."""
     by_hand: HandResult | ImuCalibrationError | None = None
-    """What poses and turns determine beside gravity, or why nothing; None with a table, and where a calibration would be wrong."""
+    """Result of a calibration by hand, or the error; None with a table, and where a calibration would be wrong."""
 
     @property
     def refused(self) -> bool:
-        """Whether a finding says that a calibration would be wrong."""
+        """Whether a finding implies that a calibration would be wrong."""
         return any(finding.severity == REFUSE for finding in self.findings)
 
     @property
     def exit_code(self) -> int:
-        """1 where a calibration would be wrong, 3 where it may suffer or something is lost or unusable, else 0."""
-        # Of spikes the findings say whether they are worth a warning.
+        """1 where a calibration would be wrong, 3 where it may suffer or data are lost or unusable, otherwise 0."""
+        # Whether spikes need a warning is decided in the findings.
         dropped = any(set(stream.dropped) - {'spike'} for stream in self.streams.values())
         if self.refused:
             return 1
@@ -69,7 +69,7 @@ def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
 
 
 def inspect(bag: str | PathLike, topics: Iterable[Topics], table: Table | None, *, options: CalibrationOptions) -> list[Look]:
-    """Look at each Imu topic of a recording, with the joints and temperatures that go with it."""
+    """Inspect each Imu topic of a recording, with the joints and temperatures used with it."""
     return [_look(bag, each, table, options) for each in topics]
 
 
@@ -83,7 +83,7 @@ def _look(bag, topics, table, options):
             calibrated = calibrate([source_of(bag, topics, table.joint_names)], table, options, mapper=_watched_by(preflight))
         except ImuCalibrationError as error:
             calibrated = error
-    if not preflight.streams:   # not read to its end: nothing to calibrate from
+    if not preflight.streams:   # not read to its end: no data to calibrate from
         preflight = Preflight(table and table.gravity_value, strict=False)
         by_hand = _by_hand(source_of(bag, topics, want_joints='optional', want_temperature='optional'), options, preflight)
     look = Look(recording, preflight.streams, preflight.findings, preflight.lost, calibrated, by_hand)
@@ -91,7 +91,7 @@ def _look(bag, topics, table, options):
 
 
 def _by_hand(source, options, preflight):
-    """Show a recording to the checks and return what it determines without a table, or why nothing."""
+    """Run the checks on a recording and return its calibration without a table, or the error."""
     try:
         recording = read_by_hand(source(), options.nominal, [preflight])
         if any(finding.severity == REFUSE for finding in preflight.findings):

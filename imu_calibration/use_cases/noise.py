@@ -18,23 +18,23 @@ from imu_calibration.use_cases.recordings import Topics, provenance_of, source_o
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedNoise:
-    """What a recording says about the noise: prints the figures, draws the Allan curves, saves noise.yaml and report.html."""
+    """Noise figures from a recording: prints them, draws the Allan curves, saves noise.yaml and report.html."""
 
     result: NoiseIdentification
-    """The identification with everything that a report needs."""
+    """The identification with all data of a report."""
     figures: NoiseFigures
-    """What noise.yaml holds."""
+    """Content of noise.yaml."""
     horizon: float = HORIZON
-    """Averaging time at which a random walk stands for other slow noise, s."""
+    """Averaging time at which a random walk approximates the slow noise, s."""
 
     @property
     def exit_code(self) -> int:
-        """0 when every figure that counts is determined and nothing was lost, else 3."""
+        """0 when every required figure is determined and no message was lost, otherwise 3."""
         return exit_code(self.figures)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What looks wrong with the recording."""
+        """Faults of the recording."""
         return tuple(finding.text for finding in warnings(self.result.record.survey.findings))
 
     def plot(self, sensor: str = 'accelerometer') -> Drawing:
@@ -70,18 +70,18 @@ def noise(recording: str | PathLike | SampleBlock, *, imu_topic: str | None = No
     recording : path-like or SampleBlock
         Bag, or samples in memory; it is read twice.
     imu_topic, temperature_topic : str, optional
-        Default /imu/data_raw and /imu/temperature, else the only topics of their types.
+        Default /imu/data_raw and /imu/temperature, otherwise the only topics of their types.
     frame_id : str, optional
         frame_id of the Imu messages; required if the topic has messages of several.
     nominal : path-like or NominalScaling, optional
         For recordings in volts or counts.
     horizon : float
-        Averaging time at which a random walk stands for other slow noise, s.
+        Averaging time at which a random walk approximates the slow noise, s.
 
     Raises
     ------
     ImuCalibrationError
-        When the recording cannot be used, or nothing in it is at rest for long enough.
+        When the recording cannot be used, or it has no rest of sufficient length.
 
     """
     topics = Topics(imu_topic, None, temperature_topic, frame_id)

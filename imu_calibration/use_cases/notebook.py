@@ -1,4 +1,4 @@
-"""The names that a notebook needs, with errors that speak of their arguments; `imu_calibration` offers them."""
+"""The names that a notebook needs, with errors in terms of their arguments; `imu_calibration` offers them."""
 
 from collections.abc import Callable, Sequence
 from functools import wraps

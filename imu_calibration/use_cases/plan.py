@@ -1,4 +1,4 @@
-"""From a table or an arm and what is wanted of its IMU to the motions that it needs."""
+"""Plan the motions of a table or an arm from the requirements on its IMU."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.stand import Stand, table_of
 
 LONGEST_SEPARATION = 180.0
-"""Time that a plan takes at most to tell effects apart, s."""
+"""Longest duration of a plan that separates effects, s."""
 ACCUMULATOR = '.npz'
-"""Ending of what a live session saves beside its calibration."""
+"""Suffix of the accumulator that a live session saves with its calibration."""
 START_NS = 1_000_000_000
 """First stamp of the bag with the trajectories: any, but the same every time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """A plan: prints what it promises, draws itself, saves plan.yaml, the trajectory and report.html."""
+    """A plan: prints its predicted accuracy, draws itself, saves plan.yaml, the trajectory and report.html."""
 
     plan: Plan
     """Motions, predicted standard deviations, time and its lower bound."""
@@ -52,12 +52,12 @@ class Planned:
 
     @property
     def exit_code(self) -> int:
-        """0 when every parameter comes within its tolerance and every joint has a range or is declared endless, else 3."""
+        """0 when every parameter reaches its tolerance and every joint has a range or is declared endless, otherwise 3."""
         return 3 if self.plan.missing or missing_ranges(self.table) else 0
 
     @property
     def notes(self) -> list[str]:
-        """What was checked and what is doubtful about the limits, a line each."""
+        """Checks and doubts about the limits, a line each."""
         return [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(self.table))]
 
     @property
@@ -116,34 +116,34 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     Parameters
     ----------
     stand : path-like, Table or Arm
-        What moves, with its limits.
+        The moving joints, with their limits.
     calibration : path-like or Calibration, optional
-        What is known already: a calibration, or the accumulator (.npz) that a live session on the same joints saved.
+        Prior data: a calibration, or the accumulator (.npz) that a live session on the same joints saved.
     grade : str
         Grade of the IMU, where no noise is given.
     imu_rate : float
         Samples of the IMU per second.
     separate : sequence of str
-        Effects to be told apart, the one that `calibration` contains first: the plan is for that instead of the tolerances.
+        Effects to separate, the one that `calibration` contains first: the plan separates them instead of reaching the tolerances.
     diagnosis : path-like or mapping, optional
-        diagnosis.json or its content, of which the first finding with others that would do as well is taken.
+        diagnosis.json or its content, of which the first finding with equivalent effects is used.
     around : mapping, optional
         Joint -> position, degrees (m where it slides), of every joint: the motion keeps to `reach` about this pose, where it begins.
     reach : float, optional
-        Degrees to either side; joints that slide stay.
+        Degrees to either side; prismatic joints do not move.
     longest : float
-        Time that telling apart may take, s.
+        Longest duration of a plan that separates effects, s.
     progress : callable, optional
-        Told the share of the way that is done.
+        Called with the completed fraction.
     with_bound : bool
-        Whether the lower bound on the time is computed; a plan far above it is searched a second time.
+        Whether the lower bound on the time is computed; a plan well above it is searched a second time.
     choices
         tolerances, noise, accelerometer_model, gyroscope_model, reference_model, catalogue, gravity: see `Choices`.
 
     Raises
     ------
     InputError
-        When the stand cannot move, or names do not fit.
+        When the joints cannot move, or names do not match.
 
     """
     table, options = table_of(stand, gravity=choices.get('gravity')), calibration_options(choices)
@@ -181,7 +181,7 @@ def _neighbourhood(limits, names, around, reach):
 
 
 def _known(calibration, table, options):
-    """Return what is known already as a Calibration, None for nothing."""
+    """Return the prior data as a Calibration, None without."""
     if not isinstance(calibration, (str, PathLike)):
         return calibration
     if Path(calibration).suffix != ACCUMULATOR:
@@ -194,18 +194,18 @@ def _known(calibration, table, options):
 
 @dataclass(frozen=True, eq=False)
 class PlannedByHand:
-    """Poses and turns of a hand: prints what they promise, saves plan.yaml and report.html."""
+    """Poses and turns by hand: prints their predicted accuracy, saves plan.yaml and report.html."""
 
     plan: HandPlan
     """Steps, predicted standard deviations, time."""
     model: HandModel
-    """What is to be determined."""
+    """Parameters to determine."""
     provenance: dict[str, Any]
     """Options that it was made with."""
 
     @property
     def exit_code(self) -> int:
-        """0 when every parameter comes within its tolerance, else 3."""
+        """0 when every parameter reaches its tolerance, otherwise 3."""
         return 3 if self.plan.missing else 0
 
     @cached_property
@@ -250,7 +250,7 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
 
 
 def hand_summary(made: HandPlan) -> list[str]:
-    """Return what a plan by hand promises, a line each."""
+    """Return the predictions of a plan by hand, a line each."""
     count = len(made.param_names)
     lines = [f'{len(made.steps)} poses and turns, about {made.seconds:.0f} s; {count - len(made.missing)} of {count} parameters are '
              'within their tolerance']
@@ -263,7 +263,7 @@ def _class_of(diagnosis):
 
 def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, float]]:
     """
-    Return the first class of effects that a diagnosis did not tell apart, the named one first, and values (SI) of the others.
+    Return the first class of inseparable effects in a diagnosis, the named one first, and values (SI) of the alternatives.
 
     Raises
     ------
@@ -280,7 +280,7 @@ def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, fl
 
 
 def summary(made: Plan) -> list[str]:
-    """Return what a plan promises, a line each."""
+    """Return the predictions of a plan, a line each."""
     if made.told_apart:
         head = f'{len(made.motions)} motions in {made.seconds:.0f} s'
         if not made.missing:

@@ -10,7 +10,7 @@ from imu_calibration.errors import InputError
 
 
 def jobs_for(asked: int | None, n_items: int) -> int:
-    """Return the number of processes: what was asked for, else one per processor; never more than there are items."""
+    """Return the number of processes: as requested, by default one per processor; at most the number of items."""
     if asked is not None and asked < 1:
         raise InputError(f'at least one process must work, got {asked}; omit the number to use every processor', key='jobs')
     return max(1, min(asked or os.cpu_count() or 1, n_items))
@@ -25,7 +25,7 @@ def process_mapper(jobs: int, done: Callable = lambda item: None) -> Callable:
     jobs : int
         Number of processes; one runs in this process.
     done : callable
-        Called with each result as it comes.
+        Called with each result as soon as it is available.
 
     """
     def mapped(function, items):
@@ -60,7 +60,7 @@ def cluster_mapper(address: str, done: Callable[[Any], object] = lambda item: No
     Raises
     ------
     InputError
-        When dask is not installed or the scheduler does not answer.
+        When dask is not installed or the scheduler does not respond.
 
     """
     try:

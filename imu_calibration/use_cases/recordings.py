@@ -16,11 +16,11 @@ from msg_adapters.bag import Recording, open_recording
 from msg_adapters.read_ahead import read_ahead
 
 Source = Callable[[], Iterator[SampleBlock]]
-"""Yields the blocks of a recording, each time anew."""
+"""Yields the blocks of a recording; can be called repeatedly."""
 
 
 class Topics(NamedTuple):
-    """Names of the topics to read; None: the default name, else the only topic of the type."""
+    """Names of the topics to read; None: the default name, otherwise the only topic of the type."""
 
     imu: str | None = None
     """sensor_msgs/Imu, default /imu/data_raw."""
@@ -66,9 +66,9 @@ def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, *,
 def source_of(recording: str | PathLike | SampleBlock, topics: Topics = Topics(), joint_names: Iterable[str] | None = None, *,
               want_joints: bool | str | None = None, want_temperature: bool | str = True, quiet: bool = False) -> Source:
     """
-    Return a callable that yields the blocks of a recording, each time anew; samples in memory are a recording of one block.
+    Return a callable, for repeated use, that yields the blocks of a recording; samples in memory are a recording of one block.
 
-    `want_joints` and `want_temperature` as for `msg_adapters.bag.open_recording`; joints are read where `joint_names` says which.
+    `want_joints` and `want_temperature` as for `msg_adapters.bag.open_recording`; joints are read if `joint_names` is given.
     """
     want_joints = joint_names is not None if want_joints is None else want_joints
     if isinstance(recording, SampleBlock):
@@ -78,12 +78,12 @@ def source_of(recording: str | PathLike | SampleBlock, topics: Topics = Topics()
 
 
 def provenance_of(recordings: Iterable[str | PathLike | SampleBlock], options: dict) -> dict:
-    """Return names and hashes of recordings and the options for a document: nothing that changes from run to run."""
+    """Return names and hashes of recordings and the options for a document: the same in every run."""
     return {'bags': [{'name': name_of(recording), 'sha256': _hash_of(recording)} for recording in recordings], 'options': options}
 
 
 def name_of(recording: str | PathLike | SampleBlock) -> str:
-    """Return what a recording is called in documents."""
+    """Return the name of a recording in documents."""
     return 'samples in memory' if isinstance(recording, SampleBlock) else Path(recording).name
 
 

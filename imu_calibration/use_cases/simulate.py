@@ -90,7 +90,7 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
     temperature : bool
         Whether there is a temperature, which warms up from 25 C; thermal effects bring it too.
     catalogue : Catalogue, path-like or mapping, optional
-        The effects that a random IMU may have, or what adds to the package's own: a file with `effects`, or {name: definition}.
+        The effects that a random IMU may have, or additions to the package's: a file with `effects`, or {name: definition}.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
     seed : int
         Of the noise.
     choices
-        See `Choices`; those of the topics and the gravity count.
+        See `Choices`; the topics and the gravity apply.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def _truth(table, calibration, grade, seed, catalogue):
 
 
 def _with_effect(model, values, name, sensor, hidden):
-    """Return (model, values) with one more effect, whose values are `hidden`."""
+    """Return (model, values) with one additional effect, whose values are `hidden`."""
     wider = model.with_effect(sensor, name)
     extended = wider.start_from(model, values)
     extended[wider.slices[sensor, name]] = hidden

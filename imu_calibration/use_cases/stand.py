@@ -1,4 +1,4 @@
-"""What moves the IMU, a table or an arm, and what it comes to for a recording."""
+"""The carrier of the IMU, a table or an arm, and its chain of joints for a recording."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from imu_calibration.use_cases.recordings import Topics, existing
 from msg_adapters.description import description_in, frame_of, static_transforms
 
 LIKELY_LINK = 'imu_link'
-"""The IMU's link where there is no recording to say its frame."""
+"""The IMU's link where no recording names its frame."""
 DESCRIPTIONS = ('.urdf', '.xacro')
 """Endings of files that describe robots."""
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A robot that carries the IMU, with what a recording may still have to say."""
+    """A robot that carries the IMU; missing entries are read from a recording."""
 
     urdf: str | PathLike | None = None
     """Robot description (.urdf or .xacro); None: that on the topic /robot_description of the recording."""
     imu_link: str | None = None
     """Link that carries the IMU; None: the frame of its messages."""
     site: str | PathLike | Mapping[str, Any] | None = None
-    """What a table description says beside the joints: file or mapping; its joints may give limits by name."""
+    """Entries of a table description other than the joints: file or mapping; its joints may give limits by name."""
     up: Sequence[float] | None = None
-    """Up in the frame of the root; None: as the site says, else /tf_static of the recording, else z."""
+    """Up in the frame of the root; None: from the site, otherwise from /tf_static of the recording, otherwise z."""
     allow_xacro: bool = False
     """Whether a .xacro file may be expanded, which runs its expressions as Python code."""
 
@@ -46,22 +46,22 @@ Stand = str | PathLike | Table | Arm
 def table_of(stand: Stand, recordings: Sequence[str | PathLike | SampleBlock] = (), topics: Topics = Topics(), *,
              gravity: float | None = None) -> Table:
     """
-    Return the chain of joints that a stand comes to.
+    Return the chain of joints of a table or an arm.
 
     Parameters
     ----------
     stand : path-like, Table or Arm
     recordings : sequence
-        The first one says the IMU's frame, how the root of a robot stands, and its description where no file is named.
+        The first one gives the IMU's frame, the attitude of a robot's root, and its description where no file is named.
     topics : Topics
         Topics of the recordings.
     gravity : float, optional
-        Local gravity for a robot whose site does not say it, m/s^2.
+        Local gravity for a robot whose site does not give it, m/s^2.
 
     Raises
     ------
     InputError
-        When a file cannot be used, or what the recordings should say is not in them.
+        When a file cannot be used, or required data are not in the recordings.
 
     """
     if isinstance(stand, Table):
@@ -83,7 +83,7 @@ def table_of(stand: Stand, recordings: Sequence[str | PathLike | SampleBlock] = 
 
 
 def _description(arm, bag):
-    """Return the text of the robot description: of the file, else of the recording's topic."""
+    """Return the text of the robot description: of the file, otherwise of the recording's topic."""
     if arm.urdf is not None:
         return files.read_robot_description(arm.urdf, arm.allow_xacro)
     if bag is None:

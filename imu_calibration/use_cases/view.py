@@ -1,4 +1,4 @@
-"""From a recording or a calibration file to what Foxglove shows of it."""
+"""From a recording or a calibration file to its view in Foxglove."""
 
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -27,12 +27,12 @@ from imu_calibration.use_cases.view_messages import PARAMETERS, RESIDUAL, SPECTR
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What is shown of a calibration."""
+    """View of a calibration."""
 
     calibration: Calibration
     """The calibration."""
     contents: dict[str, dict[str, Any]]
-    """Topic -> content, as `view_messages.SCHEMAS` say."""
+    """Topic -> content, as in `view_messages.SCHEMAS`."""
     coverage: Coverage | None
     """The sphere; None where only a file is known."""
     seconds: float = 0.0
@@ -45,7 +45,7 @@ class View:
 
     @property
     def lacks(self) -> tuple[str, ...]:
-        """What cannot be shown, and why."""
+        """Content that cannot be shown, with the reason."""
         if self.coverage is None:
             return ('a calibration file contains no residuals: only the parameters are shown; give the recording for residuals',)
         if SPECTRUM not in self.contents:
@@ -54,7 +54,7 @@ class View:
 
     def save(self, path: str | PathLike) -> None:
         """
-        Write everything as MCAP, whole or not at all.
+        Write the view as MCAP, atomically.
 
         Raises
         ------
@@ -68,7 +68,7 @@ class View:
 
 def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]) -> View:
     """
-    Return what is shown of a recording, which is calibrated, or of a calibration file: of that, the parameters alone.
+    Return the view of a recording, which is calibrated, or of a calibration file: only its parameters.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is shown of a calibration and of a compensation beside the sphere, as JSON with a schema for each topic: in a file, and live."""
+"""View of a calibration and of a compensation without the sphere, as JSON with a schema for each topic: in a file, and live."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 
-if TYPE_CHECKING:   # a compensator that shows nothing must not wait for what a calibration needs
+if TYPE_CHECKING:   # a compensator without a view must not wait for the imports of a calibration
     from imu_calibration.calibration.document import Calibration
     from imu_calibration.calibration.result import CalibrationResult
     from imu_calibration.compensation.health import HealthState
@@ -49,7 +49,7 @@ SCHEMAS = {
 
 
 def parameters(calibration: Calibration, tolerances: np.ndarray) -> dict[str, Any]:
-    """Return every parameter with tolerance and status; without bands where nobody knows how certain the values are."""
+    """Return every parameter with tolerance and status; without bands where the uncertainty of the values is unknown."""
     units = [effect.unit_of(k) for effect in calibration.model.effects for k in range(effect.size)]
     rows: list[dict[str, Any]] = [{'name': name, 'value': float(value), 'unit': unit, 'tolerance': float(tolerance), 'status': str(status)}
             for name, value, unit, tolerance, status in
@@ -61,7 +61,7 @@ def parameters(calibration: Calibration, tolerances: np.ndarray) -> dict[str, An
 
 
 def residual(result: CalibrationResult) -> dict[str, Any]:
-    """Return the errors of window means before and after, and what noise alone leaves, in the order of time."""
+    """Return the errors of window means before and after, and the expected residual from noise, in the order of time."""
     errors = result.window_errors()
     return {'windows': [{'time': float(errors.time[k]), 'motion': str(errors.kind[k]), **{
         which: _by_sensor(getattr(errors, which), k) for which in ('before', 'after', 'floor')}}
@@ -69,7 +69,7 @@ def residual(result: CalibrationResult) -> dict[str, Any]:
 
 
 def spectrum(result: CalibrationResult, windows: Sequence[Window]) -> dict[str, Any]:
-    """Return the amplitude density of what is left within windows with motion; no lines where none is long enough."""
+    """Return the amplitude density of the residuals within windows with motion; no lines where none is long enough."""
     from imu_calibration.calibration.residual_spectrum import residual_spectrum
     frequency, density = residual_spectrum(result, windows)
     return {'lines': [{'frequency': float(f), **_by_sensor(density, k)} for k, f in enumerate(frequency)]}
@@ -97,7 +97,7 @@ def readings(stretch: CorrectedStretch, sd: tuple[np.ndarray, np.ndarray]) -> It
 
 
 def health(state: HealthState) -> dict[str, Any]:
-    """Return what the last stop said."""
+    """Return the result of the last stop."""
     return {'outcome': str(state.word), 'message': state.message,
             'values': [{'name': name, 'value': str(value)} for name, value in state.values.items()]}
 
@@ -107,5 +107,5 @@ def _by_sensor(vectors, k):
 
 
 def _axes(vector):
-    """Return the components by axis; those that nobody knows are left out, for JSON has no NaN."""
+    """Return the components by axis; unknown ones are omitted, because JSON has no NaN."""
     return {axis: float(part) for axis, part in zip('xyz', vector, strict=True) if np.isfinite(part)}

@@ -48,7 +48,7 @@ def test_on_a_disk_that_is_really_full_what_was_there_stays_whole(tmp_path):
     calibration, accumulator = tmp_path / 'calibration.yaml', tmp_path / 'calibration.accumulator.npz'
     assert first == f'True; written: {calibration} and {accumulator}'
     assert second.startswith(f'False; written: {calibration}; not written: {accumulator} must be writable: No space left on device')
-    assert second.endswith('the earlier one there stays whole')
+    assert second.endswith('the earlier file is unchanged')
     assert left == "2 the second {'3'} 2"
 
 
