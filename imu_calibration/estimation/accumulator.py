@@ -1,4 +1,4 @@
-"""The streaming least-squares system: windows go in one at a time, memory stays bounded, systems of several recordings merge."""
+"""The streaming least-squares system: windows are added one at a time, memory stays bounded, systems of several recordings merge."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,14 +14,14 @@ CAPACITY = 4096
 """Mean rows kept one by one; beyond it the windows are thinned by joining neighbours of the same kind."""
 MOST_BLOCKS = 48
 """
-Blocks of consecutive windows kept apart; beyond it neighbours are joined in pairs, so that between half as many and all of them are there.
+Largest number of separate blocks of consecutive windows; beyond it neighbours are joined in pairs, to half this number at least.
 """
 LEAST_ROWS = 16
 """Rows that an accumulator keeps however many share the memory: neighbours of the same kind must be among them."""
 
 
 class _CentredRows:
-    """What stacks the centred rows of windows in its `within` and `slow`."""
+    """Addition of the centred rows of windows to the factors `within` and `slow`."""
 
     within: dict
     slow: dict
@@ -41,7 +41,7 @@ class _CentredRows:
 
 @dataclass(eq=False)
 class WindowBlock(_CentredRows):
-    """The centred rows of consecutive windows: what parts of a recording say by themselves."""
+    """The centred rows of consecutive windows, for statistics of parts of a recording."""
 
     session: int
     """Recording of the first window."""
@@ -55,12 +55,12 @@ class WindowBlock(_CentredRows):
     """As in `Accumulator`."""
 
     def add(self, window: WindowStatistics) -> None:
-        """Take the centred rows of one window."""
+        """Add the centred rows of one window."""
         self._stack_window(window)
         self.windows += 1
 
     def copy(self) -> 'WindowBlock':
-        """Return a block that goes its own way; factors are never changed in place."""
+        """Return an independent copy; factors are never changed in place."""
         return replace(self, within=dict(self.within), slow=dict(self.slow))
 
     def joined(self, other: 'WindowBlock') -> 'WindowBlock':
@@ -74,20 +74,20 @@ class WindowBlock(_CentredRows):
 @dataclass(eq=False)
 class Accumulator(_CentredRows):
     """
-    Everything that least squares needs of any number of windows.
+    Sufficient statistics of any number of windows for least squares.
 
-    Mean rows stay single, because the bias that moves from window to window makes their weights depend on one another;
-    the centred rows of each kind of window are one triangular factor per sensor.
+    Mean rows remain single, because their weights are correlated through the bias process between windows. The centred rows of each kind of
+    window are one triangular factor per sensor.
     """
 
     rows: list[WindowStatistics] = field(default_factory=list)
-    """Windows in order of time with their mean rows (WindowStatistics whose `within` is empty)."""
+    """Windows in order of time with their mean rows (WindowStatistics with empty `within`)."""
     within: dict = field(default_factory=dict)
     """(sensor, kind) -> triangular factor of the centred rows."""
     slow: dict = field(default_factory=dict)
     """(sensor, kind) -> triangular factor of the slow parts of the centred rows."""
     slow_rows: dict = field(default_factory=dict)
-    """Kind -> number of rows behind `slow`."""
+    """Kind -> number of rows in `slow`."""
     samples: dict = field(default_factory=dict)
     """Kind -> number of samples."""
     windows: dict = field(default_factory=dict)
@@ -97,12 +97,12 @@ class Accumulator(_CentredRows):
     block_length: int = 1
     """Windows per block."""
     in_blocks: bool = True
-    """Whether blocks are kept; without them standard deviations are those of noise alone."""
+    """Whether blocks are kept; without them standard deviations include noise only."""
     share: int = 1
     """Among how many accumulators of one recording the memory is shared: each keeps so many times fewer rows."""
 
     def add(self, window: WindowStatistics) -> None:
-        """Take one window (WindowStatistics)."""
+        """Add one window (WindowStatistics)."""
         self._stack_window(window)
         self.slow_rows[window.kind] = self.slow_rows.get(window.kind, 0) + window.sensors[SENSORS[0]].slow_rows
         if self.in_blocks:
@@ -117,12 +117,12 @@ class Accumulator(_CentredRows):
         return max(CAPACITY // self.share, LEAST_ROWS)
 
     def copy(self) -> 'Accumulator':
-        """Return an accumulator that goes its own way; rows and factors are never changed in place."""
+        """Return an independent copy; rows and factors are never changed in place."""
         maps: dict[str, Any] = {name: dict(getattr(self, name)) for name in ('within', 'slow', 'slow_rows', 'samples', 'windows')}
         return replace(self, rows=list(self.rows), blocks=[block.copy() for block in self.blocks], **maps)
 
     def merge(self, other: 'Accumulator') -> None:
-        """Take everything of another accumulator that has the same columns; its recordings follow this one's."""
+        """Add another accumulator with the same columns; its recordings follow the ones of this accumulator."""
         self._stack_all_of(other)
         for kind, count in other.slow_rows.items():
             self.slow_rows[kind] = self.slow_rows.get(kind, 0) + count
@@ -188,7 +188,7 @@ def stack(factors: dict, key: tuple, factor: np.ndarray) -> None:
 
 
 def _difference(first, second, sensor):
-    """Return the row that carries what differs between two windows, scaled to the noise of one sample."""
+    """Return the row of the difference of two windows, scaled to the noise of one sample."""
     scale = 1 / np.sqrt(1 / first.count + 1 / second.count)
     return scale * (first.sensors[sensor].mean - second.sensors[sensor].mean)[None, :]
 

@@ -9,7 +9,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 
 ONE_ATTITUDE = 0.02
-"""Specific forces are those of one attitude if their rms across the main direction is below this share of the rms along it, rad."""
+"""Specific forces have a single attitude if their rms across the main direction is below this share of the rms along it, rad."""
 
 
 def one_attitude(accumulators: Iterable[Accumulator], model: SensorModel) -> bool:

@@ -1,4 +1,4 @@
-"""Slow and fast parts of moving windows: weighed apart where the fast part does not fit, beyond the band of the joints or of the model."""
+"""Residual variance of the slow and fast parts of moving windows; separate weights where the fast part fits worse."""
 
 from dataclasses import dataclass, replace
 
@@ -7,44 +7,44 @@ import numpy as np
 from imu_calibration.estimation.noise_model import MovingFactors, NoiseModel
 
 APART = 2.0
-"""The parts are weighed apart from this ratio of their misfits on, fast over slow; below it all samples count alike."""
+"""The parts have separate weights above this ratio of their residual variances, fast over slow; below it all samples count alike."""
 SURE = 2.0
-"""The misfit of the slow part is taken larger by this many of its standard deviations, when it is compared and used."""
+"""The residual variance of the slow part is raised by this many of its standard deviations, in comparison and use."""
 STRONG = 1e-6
 """Directions of a scaled design with less than this share of the largest eigenvalue do not count."""
 SEEN = 1e-9
-"""The same where a misfit is to be as small as can be."""
+"""The same for the least residual."""
 WEIGHTLESS = 1e6
-"""Factor on a variance that leaves next to no weight."""
+"""Factor on a variance that makes the weight negligible."""
 
 
 @dataclass(frozen=True, eq=False)
 class BandMisfit:
-    """Variance per row of the centred rows of one kind of window: the same in all parts for white noise."""
+    """Residual variance per row of the centred rows of one kind of window; equal in all parts for white noise."""
 
     overall: np.ndarray
     """Of all rows, shape (3,)."""
     slow: np.ndarray
     """Of the means of short pieces, times the root of their length, shape (3,); zero when there are none."""
     fast: np.ndarray
-    """Of the rest, shape (3,)."""
+    """Of the other rows, shape (3,)."""
     apart: np.ndarray
-    """Whether slow and fast part are to be weighed apart, shape (3,)."""
+    """Whether slow and fast part have separate weights, shape (3,)."""
 
     def factors(self, noise: NoiseModel) -> MovingFactors:
-        """Return what moving windows with this misfit scatter beyond the noise at rest."""
+        """Return the excess variance of moving windows with this residual over the noise at rest."""
         white, unit = noise.white_variance, noise.low_variance
         samples, pieces = np.where(self.apart, self.fast, self.overall), np.where(self.apart, 0.0, self.slow)
         every = np.maximum.reduce([samples / white, pieces / unit, np.ones(3)])
         return MovingFactors(every, np.where(self.apart, np.minimum(np.maximum(self.slow / unit, 1.0), every), every))
 
     def without_fast(self) -> 'BandMisfit':
-        """Return the same with so large a variance of the fast part that its weight is zero."""
+        """Return the same with a variance of the fast part so large that its weight is zero."""
         return replace(self, fast=np.where(self.apart, WEIGHTLESS * self.fast, self.fast))
 
     @property
     def noise(self) -> np.ndarray:
-        """Return the variance to take for that of white noise when there is no rest, shape (3,)."""
+        """Return the variance that replaces the one of white noise in the absence of rest, shape (3,)."""
         return np.where(self.apart, self.slow, self.overall)
 
 
@@ -52,8 +52,8 @@ def band_misfit(total: np.ndarray, dof_total: float, slow: np.ndarray, *, dof_sl
     """
     Return the `BandMisfit` of centred rows.
 
-    A reference that is wrong at high frequency (ripple beyond what joint states show, a low-pass that the model lacks) leaves
-    more in the fast part. Where the slow part fits less well, its misfit holds for all rows: it is correlated in time then.
+    A reference with errors at high frequency (ripple beyond the band of the joint states, an unmodelled low-pass) raises the residual of
+    the fast part. Where the slow part fits worse, its residual variance applies to all rows, because the residual is correlated in time.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def band_misfit(total: np.ndarray, dof_total: float, slow: np.ndarray, *, dof_sl
 
 
 def own_misfit(rows: np.ndarray) -> np.ndarray:
-    """Return what the best fit of each axis to rows ``[columns | output]`` alone leaves of the outputs, shape (k, 3)."""
+    """Return the residuals of the least-squares fit of each axis to rows ``[columns | output]``, shape (k, 3)."""
     columns, output = rows[:, :-3], rows[:, -3:]
     scale = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(scale > 0, scale, 1.0)
@@ -83,15 +83,15 @@ def own_misfit(rows: np.ndarray) -> np.ndarray:
 
 def misfit_along(products: np.ndarray) -> tuple[float, int]:
     """
-    Return the squares of a misfit along the columns of designs, and the number of their dimensions.
+    Return the sum of squares of residuals projected on the columns of designs, and the number of dimensions.
 
-    For misfit e and design A: ``e' A (A'A)^+ A' e`` and the rank of A, summed over designs. Their ratio is the variance of e when e is
-    noise, and more by as many times as there are samples when the misfit asks for other parameters than were given.
+    For residual e and design A: ``e' A (A'A)^+ A' e`` and the rank of A, summed over designs. Their ratio is the variance of e when e is
+    white noise. It grows with the number of samples when the best-fit parameters differ from the given ones.
 
     Parameters
     ----------
     products : array, shape (k, q + 1, q + 1)
-        Products of ``[design | misfit]``.
+        Products of ``[design | residual]``.
 
     """
     gram, gradient = products[:, :-1, :-1], products[:, :-1, -1]
@@ -103,7 +103,7 @@ def misfit_along(products: np.ndarray) -> tuple[float, int]:
 
 
 def least_misfit(products: np.ndarray) -> tuple[float, int]:
-    """Return the squares that the best fit leaves of products of ``[design | output]``, shape (q + 1, q + 1), and the design's rank."""
+    """Return the residual sum of squares of the best fit from products of ``[design | output]``, shape (q + 1, q + 1), and the rank."""
     scale = np.append(_scales(np.diag(products)[:-1]), 1 / np.sqrt(max(products[-1, -1], 1e-300)))
     scaled = products * np.outer(scale, scale)
     eigenvalues, vectors = np.linalg.eigh(scaled[:-1, :-1])
@@ -113,5 +113,5 @@ def least_misfit(products: np.ndarray) -> tuple[float, int]:
 
 
 def _scales(squares):
-    """Return what makes columns of unit length; 0 for one of which rounding left nothing, or less: it says nothing along it."""
+    """Return the scales that give columns unit length; 0 for a column that is zero or negative through rounding."""
     return np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)

@@ -1,4 +1,4 @@
-"""Windows that do not belong to the others of their kind: somebody leaned on the table or shoved the IMU while it was thought to rest."""
+"""Outlying windows: their mean is inconsistent with the other windows of their kind, as after a knock during an assumed rest."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,26 +12,26 @@ from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.weighted_system import WeightedSystem
 
 P_VALUE = 1e-3
-"""Chance that a recording without such windows loses one, per sensor and kind."""
+"""False positive rate per sensor and kind for a recording without outliers."""
 SHARE = 0.15
-"""Of each kind, at most this share is left out: what is more frequent is how the recording is."""
+"""Largest share of each kind that is excluded; a more frequent deviation is a property of the recording."""
 LEAST_SPARE = 9.0
-"""Degrees of freedom that the others of the kind must leave to judge by."""
+"""Residual degrees of freedom of the other windows of the kind that the test requires."""
 CANDIDATES = 8
-"""Windows of each kind that are looked at in one round, those that fit worst."""
+"""Windows of each kind under test per round, in order of their residual."""
 LEAST_SEEN = 0.05
-"""A window that keeps less than this share of its error after the fit says nothing."""
+"""A window whose error keeps less than this share in the residuals is not tested."""
 
 
 def contradicted(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> dict[str, frozenset]:
     """
-    Return sensor -> keys of the windows whose mean the others of its kind contradict, beyond those that the noise leaves out already.
+    Return sensor -> keys of the outlying windows by kind, without the ones that the noise model excludes already.
 
-    Of one kind at a time, the one with the least probable of them: a bias that seems to move makes the neighbours of such a window stand
-    out, too.
+    Mean-shift F test, one kind of window per round (the one with the least probable outlier), because with a bias process one outlier makes
+    its neighbours look inconsistent.
 
-    With an offset of its own for one window the others must fit improbably better (F test, for as many windows as there are). The noise may
-    have been estimated with that window: too large by it, it is too large for all, and the ratio stays.
+    A separate offset for one window must improve the fit of the other windows significantly (F test with Bonferroni correction). The noise
+    may be overestimated because of that window; the factor is common to all windows and cancels in the ratio.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def contradicted(system: WeightedSystem, values: np.ndarray, noises: dict[str, N
     values : ndarray, shape (n_params,)
         The estimate.
     noises : dict
-        Sensor -> NoiseModel, with which it was made.
+        Sensor -> NoiseModel of the estimate.
 
     """
     found, kinds = {}, np.array(system.kinds)
@@ -51,7 +51,7 @@ def contradicted(system: WeightedSystem, values: np.ndarray, noises: dict[str, N
 
 
 def _of_kind(own: np.ndarray, out: np.ndarray, fit: '_Fit') -> tuple[float, list[int]]:
-    """Return (the least chance, the numbers of the windows `own` that do not belong to the others), besides those that are `out`."""
+    """Return (the smallest p-value, the numbers of the outliers among the windows `own`), without the windows `out`."""
     count, kept = int(own.sum()), np.flatnonzero(own & ~out)
     allowed = max(1, int(SHARE * count)) - (count - len(kept))
     worst = kept[np.argsort(-(fit.rest[kept]**2).sum(axis=1), kind='stable')][:CANDIDATES] if allowed > 0 else []
@@ -61,7 +61,7 @@ def _of_kind(own: np.ndarray, out: np.ndarray, fit: '_Fit') -> tuple[float, list
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Whitened means of one sensor beside everything else that is known of its parameters."""
+    """Whitened means of one sensor with the normal matrix of centred rows and prior."""
 
     rest: np.ndarray
     """Whitened residuals, shape (n_windows, 3)."""
@@ -70,7 +70,7 @@ class _Fit:
     covariance: np.ndarray
     """Of the parameters, shape (q, q)."""
     whiten: Callable
-    """What whitens columns, shape (n_windows, 3, k)."""
+    """Function that whitens columns, shape (n_windows, 3, k)."""
 
     @classmethod
     def of(cls, system: WeightedSystem, sensor: str, values: np.ndarray, noise: NoiseModel) -> '_Fit':
@@ -81,7 +81,7 @@ class _Fit:
                    lambda columns: system.whitened(columns, noise))
 
     def p_value(self, at: int, own: np.ndarray) -> float:
-        """Return the chance that the windows `own` fit so much better with an offset of its own for window `at`."""
+        """Return the p-value of the improvement of the windows `own` by a separate offset for window `at`."""
         one = np.zeros(self.rest.shape + (1,))
         one[at] = 1.0
         one = self.whiten(one)[:, :, 0]

@@ -17,7 +17,7 @@ MODEL_ERROR = 'model_error'
 DRIFT = 'drift'
 """Parameters that change during the recording."""
 REJECTED = 'rejected_effects'
-"""Effects that were rejected, or are collinear with others in the recording."""
+"""Effects that were rejected, or are collinear with other effects in the recording."""
 GRAVITY = 'gravity'
 """The uncertainty of the local gravity."""
 EARTH_RATE = 'earth_rate'
@@ -45,10 +45,10 @@ def replace_weak(values: np.ndarray, terms: Terms, prior: np.ndarray, *,
     Return (values, terms, mask of the replaced parameters) with weak values replaced by their prior where that lowers the expected error.
 
     A value v with prior p and standard deviation s of the fit is replaced where ``(v - p)^2 < s^2``. The parameter with the smallest ratio
-    is replaced first; all parameters correlated with it are estimated again with it fixed, ``x += C[:, k] / C[k, k] (p - v)``, C being the
-    posterior covariance of the fit, before the others are tested. The error of the result is that of the estimate and the shift d, so that
+    is replaced first; all parameters correlated with it are updated with it fixed, ``x += C[:, k] / C[k, k] (p - v)``, C being the
+    posterior covariance of the fit, before the next test. The error of the result is that of the estimate and the shift d, so that
     its covariance is the former one plus ``d d'``: at most twice the former variance. The variance of the prior itself would ignore the
-    recording, which bounds the parameter far more closely.
+    recording, which bounds the parameter much more closely.
 
     Parameters
     ----------

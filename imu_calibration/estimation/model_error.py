@@ -1,9 +1,9 @@
 """
-What standard deviations must allow for beside noise: misfit that differs from stretch to stretch, and parameters that drift.
+Model error in standard deviations: residuals that differ between parts of the recording, and parameters that drift.
 
-The gradient of the cost falls into parts, one for each block of consecutive windows; at the estimate they add up to nothing. Their sums
-weighted with slow cosines of the blocks' numbers are, times the covariance, what parts of the recording ask for beyond the whole, and
-noise alone says how large they may be. Where they are larger than chance allows, the covariance grows.
+The gradient of the cost is a sum over blocks of consecutive windows; at the estimate it is zero. Sums weighted with slow cosines of the
+block number, times the covariance, are shifts of the estimate between parts of the recording. Their covariance under noise is known;
+where the shifts exceed it significantly, the covariance grows.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,15 +20,15 @@ from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.weighted_system import WeightedSystem
 
 LEAST_BLOCKS = 8
-"""Fewer blocks tell nothing of their scatter."""
+"""Fewest blocks for an estimate of the scatter."""
 MOST_WAVES = 12
-"""Cosines used; faster ones say no more than the scatter within windows does."""
+"""Number of cosines; faster ones add no information to the scatter within windows."""
 SLOW_WAVES = 3
 """Cosines that show a drift."""
 CHANCE = 0.01
-"""Chance of a drift for each sensor, and of misfit for each, in a recording without."""
+"""False positive rate per sensor, for a drift and for model error."""
 UNSEEN = 1.5
-"""Factor on the variance of misfit in excess of noise: misfit that is the same in every block does not scatter between blocks."""
+"""Factor on the excess variance over noise: model error that is equal in every block causes no scatter between blocks."""
 NO_BIAS = 30.0
 """Biases wander with longer correlation times than this, s."""
 SEEN = 1e-6
@@ -37,10 +37,10 @@ SEEN = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ModelError:
-    """What the covariance grows by."""
+    """Allowances that are added to the covariance."""
 
     factor: np.ndarray
-    """Factor on the standard deviations that noise alone gives, at least 1, shape (n_params,)."""
+    """Factor on the standard deviations from noise, at least 1, shape (n_params,)."""
     drift_variance: np.ndarray
     """Variance to add for parameters that drift, shape (n_params,)."""
     scatter_variance: np.ndarray
@@ -54,7 +54,7 @@ class ModelError:
 
 def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel], *, free: np.ndarray) -> ModelError:
     """
-    Return by how much the blocks of a recording ask for different parameters than noise explains.
+    Return the model error from the scatter of parameters between blocks, beyond noise.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, No
     values : ndarray, shape (n_params,)
         The estimate.
     noises : dict
-        Sensor -> NoiseModel, with which it was made.
+        Sensor -> NoiseModel of the estimate.
     free : ndarray of bool, shape (n_params,)
         Parameters that were estimated.
 
@@ -73,19 +73,19 @@ def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, No
     model = system.model
     groups = {sensor: [model.slices[e.key] for e in model.effects if e.sensor == sensor] for sensor in {e.sensor for e in model.effects}}
     found, misfits = errors_of_waves(waves, len(values), groups=groups)
-    if 'accelerometer' in misfits:   # what goes with the attitude has a mean as large as its scatter, and the bias takes it
+    if 'accelerometer' in misfits:   # an error that depends on the attitude has a mean as large as its scatter, absorbed by the bias
         found.scatter_variance[system.model.part('accelerometer', Role.OFFSET)] += UNSEEN * _scatter_of_means(noises['accelerometer'])
     return found
 
 
 def _scatter_of_means(noise):
-    """Return the variance by which means of windows differ, as offsets or as a bias too fast to be one."""
+    """Return the variance of the means between windows, from offsets and from bias processes too fast for a bias."""
     return noise.offset_sd**2 + sum(process.sd**2 for process in noise.bias_processes if process.time < NO_BIAS)
 
 
 def errors_of_waves(waves: 'Waves', size: int, *, groups: Mapping[str, Sequence[slice]]) -> tuple[ModelError, set[str]]:
     """
-    Return (ModelError, sensors that misfit) from what parts of a recording ask for.
+    Return (ModelError, sensors with significant scatter) from the shifts between parts of a recording.
 
     Parameters
     ----------
@@ -152,18 +152,18 @@ def _waves_of_blocks(information, gradient, prior_root, free):
 
 class Waves:
     """
-    What cosines over a recording ask of the parameters, with the covariance that noise gives it.
+    Shifts of the parameters along slow cosines over a recording, with their covariance under noise.
 
     Parameters
     ----------
     places : array of int, shape (m,)
         Parameters that were estimated.
     moved : array, shape (k, m)
-        What each cosine asks for beyond the whole.
+        Shift along each cosine.
     expected : array, shape (k, m, m)
-        Its covariance by noise alone.
+        Its covariance under noise.
     covariance : array, shape (m, m)
-        Of the estimate, by noise alone.
+        Of the estimate, under noise.
 
     """
 
@@ -174,15 +174,15 @@ class Waves:
         self._seen = np.all(np.einsum('kii->ki', expected) > SEEN * np.diag(covariance), axis=0)
 
     def group(self, part: slice) -> np.ndarray:
-        """Return the places among the free parameters of those of one effect that the recording shows."""
+        """Return the indices among the free parameters of one effect with information from the recording."""
         return np.flatnonzero((self.places >= part.start) & (self.places < part.stop) & self._seen)
 
     def drift(self, group: np.ndarray) -> tuple[float, np.ndarray]:
         """
-        Return (chance of so slow a change by noise, variance to add for it, shape (n,)) of parameters that each walk at random.
+        Return (p-value of a slow change, variance to add for it, shape (n,)) of parameters that are independent random walks.
 
-        All alike, but for those that walk by more by themselves. The mean over another recording of the same length differs by two thirds
-        of the variance that the walk reaches in one, a third for each of both.
+        One common variance, or a larger one for a parameter with a significant walk. The means of two recordings of equal length differ by
+        two thirds of the variance that the walk reaches in one recording, a third from each.
         """
         p_value, common = self._walked(group)
         own = [self._walked(at) for at in group[:, None]]
@@ -190,10 +190,10 @@ class Waves:
 
     def _walked(self, group):
         """
-        Return (chance, variance to add) by the score test of the variance of a walk.
+        Return (p-value, variance to add) by the score test of the variance of a walk.
 
-        What is not white but goes up and down fast, as the ripple of a motor, counts as noise and leaves less in the slow cosines than
-        noise is thought to: where the faster ones scatter by less, the slow ones are judged beside them.
+        Fast variation that is not white, such as the ripple of a motor, is part of the noise and makes the slow cosines smaller than
+        expected: where the faster ones scatter less than expected, they are the reference of the test (F instead of chi-square).
         """
         inverse, walk, moved = self._inverse(group), self.walk[:SLOW_WAVES], self.moved[:, group]
         fast = np.einsum('ki,kij,kj->k', moved, inverse, moved)[SLOW_WAVES:]
@@ -211,7 +211,7 @@ class Waves:
         return float(p_value), max(score - mean, 0.0) / spread / 3 * float(dof_factor(dof))
 
     def scatter(self, group: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return (chance of so much scatter by noise, factor on the variance of each parameter) of a group."""
+        """Return (p-value of the scatter, factor on the variance of each parameter) of a group."""
         moved = self.moved[:, group]
         ratio = np.einsum('ki,kij,kj->k', moved, self._inverse(group), moved).sum() / moved.size
         single = (moved**2 / np.einsum('kii->ki', self.expected)[:, group]).mean(axis=0)

@@ -1,23 +1,23 @@
-"""White noise from windows at rest, and what the means of those scatter that vibrate."""
+"""White noise from windows at rest, and the variance of the means of vibrating windows."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 LEAST_INFLATION, LEAST_SHAKEN = 0.8, 0.01
-"""Noise at low frequency is not taken for less than these shares of white noise of the same variance, at rest and where it vibrates."""
+"""Least noise at low frequency as a share of white noise of the same variance, at rest and under vibration."""
 LEAST_NOISE = {'accelerometer': 1e-6, 'gyroscope': 1e-7}
-"""No sample is taken for better than this, m/s^2 and rad/s: readings of a simulator without noise are exact but for stamps in whole ns."""
+"""Least noise of a sample, m/s^2 and rad/s: readings of a noise-free simulator are exact except for stamps in integer ns."""
 VIBRATES = 4.0
-"""A table vibrates in a window whose variance is above so many times that of quiet ones."""
+"""A table vibrates in a window whose variance exceeds the quiet level by this factor."""
 
 
 def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | None:
     """
     Return (white_variance, inflation) pooled over static windows, each shape (3,), or None without static windows.
 
-    Windows whose variance lies far from the median (clipped, knocked) are left out; far from the quietest level where a table vibrates,
-    now more, now less: a vibration leaves the means nearly as they are.
+    Windows whose variance differs from the median by more than a factor of two (clipped, knocked) are excluded. If vibration varies, the
+    reference is the quietest level instead of the median, because vibration hardly affects the means.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def _usual(variances, inflations):
 
 
 def shaken_means(rows: Sequence, sensor: str) -> dict[tuple[int, float], np.ndarray]:
-    """Return `NoiseModel.shaken` of a sensor: of each rest that vibrates far more than the quiet ones."""
+    """Return `NoiseModel.shaken` of a sensor, for each rest whose vibration exceeds the quiet level."""
     static = [row for row in rows if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))]
     if not static:
         return {}

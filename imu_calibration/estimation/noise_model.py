@@ -1,4 +1,4 @@
-"""The noise of one sensor: white noise within windows, offsets of windows, bias processes, what moving windows scatter beyond."""
+"""The noise of one sensor: white noise within windows, offsets of windows, bias processes, excess variance of moving windows."""
 
 from dataclasses import dataclass, field, replace
 from typing import Sequence
@@ -8,23 +8,23 @@ import numpy as np
 from imu_calibration.constants import STANDARD_GRAVITY
 
 HOUR = 3600.0
-"""s; sessions are hardly longer, and what a bias does over days does not move within one."""
+"""s; sessions are hardly longer, and changes of a bias over days are constant within a session."""
 DOF_FACTOR_MOST = 3.0
 """Largest factor by which a variance grows because it was itself estimated."""
 
 
 @dataclass(frozen=True)
 class BiasProcess:
-    """First-order Gauss-Markov process of the bias: covariance ``sd^2 exp(-|dt| / time)``, the same on all axes, each on its own."""
+    """First-order Gauss-Markov process of the bias: covariance ``sd^2 exp(-|dt| / time)``, the same on all axes, independent."""
 
     sd: float
     """Standard deviation, m/s^2 or rad/s."""
     time: float
-    """Correlation time, s; long against the session it is a random walk, several of them in a row of times make flicker noise."""
+    """Correlation time, s; a random walk if long compared with the session; several processes at spaced times approximate flicker noise."""
 
     def within(self, duration: float) -> float:
         """
-        Return the standard deviation about its mean over a time, s: what a session sees of it.
+        Return the standard deviation about the mean over a duration, s: the part visible in a session.
 
         ``sd^2 (1 - 2 r (1 - r (1 - exp(-1 / r))))`` with r the correlation time over the duration.
         """
@@ -34,20 +34,20 @@ class BiasProcess:
 
 @dataclass(frozen=True)
 class ReferenceNoise:
-    """What the reference itself adds to means of windows: joints that are read in steps."""
+    """Contribution of the reference to the variance of window means: quantisation of the joint readings."""
 
     turn: float = 0.0
-    """Standard deviation of the turn between two readings, rad; over the length of a window it is one of the mean rate."""
+    """Standard deviation of the turn between two readings, rad; divided by the window length, of the mean rate."""
     level: float = 0.0
     """Standard deviation of gravity's components at rest, m/s^2."""
 
     @classmethod
     def of_steps(cls, step: float, sensor: str) -> 'ReferenceNoise':
         """
-        Return that of a sensor beside encoders with a step, rad.
+        Return the reference noise of a sensor for encoders with a step, rad.
 
-        A reading errs by ``step / sqrt(12)``, a turn by ``step / sqrt(6)``. An attitude that errs about one axis shows in two components
-        of gravity's three.
+        The error of a reading is ``step / sqrt(12)``, of a turn ``step / sqrt(6)``. An error of the attitude about one axis affects two
+        of the three components of gravity.
         """
         return cls(turn=step / np.sqrt(6)) if sensor == 'gyroscope' else cls(level=STANDARD_GRAVITY * step / np.sqrt(12) * np.sqrt(2 / 3))
 
@@ -59,16 +59,16 @@ class ReferenceNoise:
 
 @dataclass(frozen=True, eq=False)
 class MovingFactors:
-    """What moving windows of one kind scatter beyond the noise at rest, as factors on ``white_variance * inflation``, each shape (3,)."""
+    """Excess variance of moving windows of one kind over the noise at rest: factors on ``white_variance * inflation``, each shape (3,)."""
 
     every: np.ndarray
     """On the variance of the centred rows."""
     slow: np.ndarray
-    """On that of their slow part, where it fits better than the fast one; else as `every`."""
+    """On the variance of their slow part, where it fits better than the fast one; otherwise as `every`."""
     means: np.ndarray = field(default_factory=lambda: np.ones(3))
-    """On the variance of the windows' means by the noise within."""
+    """On the variance of the window means due to the noise within windows."""
     along: float = 1.0
-    """Part of `every` that comes from misfit along the columns of the model, correlated in time; at least 1."""
+    """Part of `every` due to misfit along the columns of the model, correlated in time; at least 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +77,8 @@ class NoiseModel:
     Noise of one sensor.
 
     The mean of window k has variance ``white_variance * inflation / n_k + offset_sd^2`` and, with its neighbours in the same recording,
-    the covariance ``sum(sd^2 exp(-|t_k - t_l| / time)) + session_variance`` over the bias processes, seen at the middles of the windows;
-    beside these middles means scatter by what biases wander within (`means_beside_middles`).
+    the covariance ``sum(sd^2 exp(-|t_k - t_l| / time)) + session_variance`` over the bias processes, evaluated at the middles of the
+    windows. The change of the bias within a window adds the variance `means_beside_middles` to its mean.
     """
 
     white_variance: np.ndarray
@@ -88,23 +88,23 @@ class NoiseModel:
     offset_sd: float = 0.0
     """Standard deviation of an independent offset per window."""
     bias_processes: tuple[BiasProcess, ...] = ()
-    """How the bias moves from window to window."""
+    """Processes of the bias between windows."""
     known: tuple[BiasProcess, ...] = ()
-    """Those of them that were measured apart, on a recording at rest."""
+    """The ones that were measured separately, on a recording at rest."""
     middle_wander: float = 0.0
-    """Standard deviation of the bias process on the middle one of the axes, where it is so large that this was asked."""
+    """Standard deviation of the bias process on the middle one of the axes, where it is large enough for a test per axis."""
     moving: dict[str, MovingFactors] = field(default_factory=dict)
-    """Kind of window -> what it scatters beyond the noise at rest."""
+    """Kind of window -> excess variance over the noise at rest."""
     session_sd: float = 0.0
     """Standard deviation of the bias from recording to recording; zero when the recordings agree or there is one."""
     session_variance: float = 0.0
-    """Its square, larger when few recordings leave it uncertain: what weights and standard deviations are made with."""
+    """Its square, increased for few recordings; used in weights and standard deviations."""
     reference: ReferenceNoise = ReferenceNoise()
-    """What the reference adds to the means of windows."""
+    """Contribution of the reference to the window means."""
     shaken: dict[tuple[int, float], np.ndarray] = field(default_factory=dict)
-    """(recording, middle in s) of rests that vibrate -> variance of their means as they show it themselves, shape (3,)."""
+    """(recording, middle in s) of rests that vibrate -> variance of their means from their samples, shape (3,)."""
     left_out: frozenset[tuple[int, float]] = frozenset()
-    """(recording, middle in s) of windows that the others contradict: their means count for nothing."""
+    """(recording, middle in s) of outlying windows: their means have no weight."""
 
     @property
     def white_sd(self) -> np.ndarray:
@@ -131,7 +131,7 @@ class NoiseModel:
         """
         Return the variance of means of windows of these kinds and lengths (samples; s) by the noise within and the reference, (k, 3).
 
-        Of windows with `keys` (recording, middle in s) that vibrate at least what they show themselves.
+        The variance of vibrating windows with `keys` (recording, middle in s) is at least the one estimated from their samples.
         """
         factors = {kind: moving.means for kind, moving in self.moving.items()}
         white = self.low_variance * np.stack([factors.get(kind, np.ones(3)) for kind in kinds]) / np.asarray(counts, float)[:, None]
@@ -141,11 +141,11 @@ class NoiseModel:
 
     def variance_beside_bias(self, kinds: Sequence[str] | np.ndarray, counts: np.ndarray, durations: np.ndarray, *,
                              keys: Sequence[tuple[int, float]] = ()) -> np.ndarray:
-        """Return the same beside the bias as it is in the middle of each window: with what it wanders within, shape (k, 3)."""
+        """Return the same relative to the bias in the middle of each window: with its change within the window, shape (k, 3)."""
         return self.mean_variance(kinds, counts, durations, keys=keys) + means_beside_middles(self.bias_processes, durations)[:, None]
 
     def wander_within(self, offsets: np.ndarray) -> np.ndarray:
-        """Return the covariance of the bias at instants about the middle of a window, s, beside its value there, shape (n, n)."""
+        """Return the covariance of the bias at instants about the middle of a window, s, given its value there, shape (n, n)."""
         away, apart = np.abs(offsets), np.abs(np.subtract.outer(offsets, offsets))
         return sum((process.sd**2 * (np.exp(-apart / process.time) - np.exp(-np.add.outer(away, away) / process.time))
                     for process in self.bias_processes), np.zeros(apart.shape))
@@ -156,7 +156,7 @@ class NoiseModel:
 
     def slow_weight(self, kind: str) -> np.ndarray:
         """
-        Return the weight w of the slow part of centred rows beside all of them at `row_variance`, ``w^2 = 1/slow - 1/every``, shape (3,).
+        Return the additional weight w of the slow part of centred rows, ``w^2 = 1/slow - 1/every``, shape (3,).
 
         The sum of squares is then ``fast / every + slow / slow``, without a difference of factors.
         """
@@ -166,14 +166,14 @@ class NoiseModel:
         return np.sqrt(np.maximum(1 / factors.slow - 1 / factors.every, 0.0) / self.low_variance)
 
     def at_rest_only(self, *processes: BiasProcess) -> 'NoiseModel':
-        """Return what noise alone would be: no offsets, no misfit along the columns, and only the bias processes that are given."""
+        """Return the model of noise only: no offsets, no misfit along the columns, and only the given bias processes."""
         moving = {kind: replace(factors, every=factors.every / factors.along) for kind, factors in self.moving.items()}
         moving = {kind: replace(factors, means=np.minimum(factors.means, np.maximum(factors.every, 1.0))) for kind,
                   factors in moving.items()}
         return replace(self, moving=moving, offset_sd=0.0, bias_processes=processes)
 
     def weighs_alike(self, other: 'NoiseModel', change: float = 0.05) -> bool:
-        """Return whether slow parts count no more than fast ones, or both as with `other`, to a relative change of their variances."""
+        """Return whether slow parts count no more than fast ones, or the weights equal `other` within a relative change of variance."""
         for kind, mine in self.moving.items():
             if np.all(mine.slow == mine.every):
                 continue
@@ -187,10 +187,10 @@ class NoiseModel:
 
 def means_beside_middles(processes: Sequence[BiasProcess], durations: np.ndarray | float) -> np.ndarray:
     """
-    Return the variance of the mean of a wandering bias over windows of these lengths (s) beside its value in their middles.
+    Return the variance of the mean of a bias process over windows of these lengths (s) relative to its value in their middles.
 
-    Of a random walk with ``2 sd^2 / time`` per second it is ``sd^2 T / (6 time)``. It fades in windows longer than a bias remembers,
-    whose means its value in the middle overstates already.
+    For a random walk with ``2 sd^2 / time`` per second it is ``sd^2 T / (6 time)``. It decreases in windows longer than the correlation
+    time, where the value in the middle overstates the variance of the mean.
     """
     total = np.zeros(np.shape(durations))
     for process in processes:
@@ -200,7 +200,7 @@ def means_beside_middles(processes: Sequence[BiasProcess], durations: np.ndarray
 
 
 def dof_factor(dof: np.ndarray | float) -> np.ndarray:
-    """Return dof / (dof - 2), the variance of the t distribution, at most DOF_FACTOR_MOST: by it a variance from few data grows."""
+    """Return dof / (dof - 2), the variance of the t distribution, at most DOF_FACTOR_MOST: factor on a variance from few data."""
     return np.minimum(dof / np.maximum(np.subtract(dof, 2), 1e-9), DOF_FACTOR_MOST)
 
 

@@ -1,4 +1,4 @@
-"""How large the offsets of windows, the bias process and its steps between recordings are: averaged over the restricted likelihood."""
+"""Standard deviations of window offsets, of the bias process and of its steps between recordings: means over the restricted likelihood."""
 
 from collections.abc import Sequence
 
@@ -8,11 +8,11 @@ from imu_calibration.estimation.noise_model import BiasProcess, dof_factor, mean
 from imu_calibration.estimation.restricted_likelihood import RestrictedLikelihood, profile
 
 TYPICAL_TIME, TIME_SPREAD = 100.0, 0.8
-"""Correlation times of MEMS biases: around 100 s, log-normal; a short session cannot tell them (field catalogue, section 6)."""
+"""Correlation times of MEMS biases: around 100 s, log-normal; a short session does not determine them (field catalogue, section 6)."""
 CLEAR_GAIN = 30.0
-"""Fall of minus twice the log likelihood beyond which the size of a bias process is plain and its best estimate is taken."""
+"""Fall of minus twice the log likelihood beyond which a bias process is significant and its maximum-likelihood estimate is used."""
 SESSION_GAIN = 6.6
-"""The same for biases that differ from recording to recording: chi-square, one degree of freedom on its boundary, 0.5 %."""
+"""The same for biases that differ between recordings: chi-square, one degree of freedom on its boundary, 0.5 %."""
 OFFSET_GRID = np.array([0.0, 0.3, 0.7, 1.5, 3.0, 6.0, 12.0, 25.0, 50.0, 100.0])
 BIAS_GRID = np.array([0.15, 0.25, 0.4, 0.63, 1.0, 1.6, 2.5, 4.0, 6.3, 10.0, 25.0, 60.0])
 TIME_GRID = np.array([40.0, 100.0, 250.0])
@@ -20,9 +20,9 @@ TIME_GRID = np.array([40.0, 100.0, 250.0])
 SESSION_GRID = 4.0 ** np.arange(-3, 8)
 """Steps from recording to recording in the same units; the best of them is refined by factors of two and of the root of two."""
 FLICKER, FLICKER_TIMES = 0.0, (1.0, 5.0, 25.0, 125.0, 625.0)
-"""Correlation time that stands for flicker: as much with each of some times in a row, s, from that of a window to that of a session."""
+"""Correlation time that denotes flicker: equal variance at spaced times, s, from the length of a window to the length of a session."""
 LEAST_WINDOWS = 12
-"""Fewer windows say nothing of a bias process."""
+"""Fewest windows for the estimate of a bias process."""
 
 
 class NoiseLikelihood:
@@ -38,7 +38,7 @@ class NoiseLikelihood:
     white : ndarray, shape (n, n_axes)
         Variance of the means by the noise within windows.
     known : tuple of BiasProcess
-        Processes that are there in any case.
+        Processes that are always included.
     durations : ndarray, shape (n,), optional
         Lengths of the windows, s.
 
@@ -53,7 +53,7 @@ class NoiseLikelihood:
         self._likelihood, self._losses = RestrictedLikelihood(rows, times, sessions, information=information), {}
 
     def loss(self, shape: tuple, used: Sequence[int] | np.ndarray | None = None, *, session: float = 0.0) -> float:
-        """Return minus twice the restricted log likelihood with the parameters `used`, all where not given."""
+        """Return minus twice the restricted log likelihood with the parameters `used`, by default all."""
         key = (*map(float, shape), float(session))
         if key not in self._losses:
             offset, bias, time, step = np.multiply(key, (self.typical, self.typical, 1.0, self.typical))
@@ -67,7 +67,7 @@ class NoiseLikelihood:
         return logs + profile(normal)
 
     def of_axis(self, axis: int, shape: tuple) -> 'NoiseLikelihood':
-        """Return the same of the noise of one axis, that of the others as the shape says; in units of the axis' own typical noise."""
+        """Return the likelihood of the noise of one axis, the other axes fixed at the shape; in units of the axis' own typical noise."""
         offset, bias, time = np.multiply(shape, (self.typical, self.typical, 1.0))
         others = np.arange(self._white.shape[1]) != axis
         processes = self.processes(bias, time)
@@ -77,7 +77,7 @@ class NoiseLikelihood:
                                known=self.known, durations=self._durations)
 
     def processes(self, sd: float, time: float) -> tuple[BiasProcess, ...]:
-        """Return the known processes with one more, or with those of flicker, where their standard deviation is above zero."""
+        """Return the known processes plus one more (or the flicker processes) if its standard deviation is above zero."""
         times = FLICKER_TIMES if time == FLICKER else (time,)
         return (*self.known, *(BiasProcess(sd / float(np.sqrt(len(times))), each) for each in times)) if sd > 0 else self.known
 
@@ -87,10 +87,10 @@ def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, 
     """
     Return the fields of `NoiseModel` that concern offsets: offset_sd, bias_processes, session_sd, session_variance.
 
-    A short session leaves open how large a bias process is, and a bias is only as certain as its process is small. So the
-    variances are averaged over the likelihood (posterior means on a grid); only a process that is plain gets its best value.
-    With several recordings the bias may differ from one to the next; it does when the likelihood gains `SESSION_GAIN`
-    over the best that offsets and process alone can do. Where it is known how the bias moves, a further process must be plain.
+    A short session does not determine the size of a bias process, and the sd of a bias depends on that size. So the
+    variances are averaged over the likelihood (posterior means on a grid); only a significant process is set to its best estimate.
+    With several recordings a bias per recording is included if the likelihood gains `SESSION_GAIN` over the best fit
+    with offsets and process. Where bias processes are known, a further process must be significant.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, 
 
 
 class _Search:
-    """The likelihood times what is known of correlation times, on a grid of shapes, for a given sd from recording to recording."""
+    """The likelihood times the prior of correlation times, on a grid of shapes, for a given sd between recordings."""
 
     def __init__(self, likelihood):
         self.likelihood = likelihood
@@ -128,7 +128,7 @@ class _Search:
         return self.likelihood.loss(shape, session=session) + (np.log(shape[2] / TYPICAL_TIME) / TIME_SPREAD)**2
 
     def grid(self, session):
-        """Return the shapes tried, shape (k, 3), and their costs; those without bias process come first."""
+        """Return the shapes tried, shape (k, 3), and their costs; shapes without bias process are first."""
         trials = [(offset, 0.0, TYPICAL_TIME) for offset in OFFSET_GRID]
         alone = np.array([self.cost(trial, session) for trial in trials])
         offsets = np.unique(np.concatenate([[0.0], OFFSET_GRID[alone < alone.min() + 20.0]]))
@@ -136,7 +136,7 @@ class _Search:
         return np.array(trials + moving), np.concatenate([alone, [self.cost(trial, session) for trial in moving]])
 
     def best_session(self, shape):
-        """Return the likeliest sd from recording to recording, beside the best offsets and process without it and beside none."""
+        """Return the likeliest sd between recordings, over the best offsets and process, the offsets without process, and neither."""
         shapes = [tuple(shape), (shape[0], 0.0, TYPICAL_TIME), (0.0, 0.0, TYPICAL_TIME)]
         shapes += [(0.0, bias, TYPICAL_TIME) for bias in self.biases[::4]]
 
@@ -160,7 +160,7 @@ class _Search:
 
     def _best(self, start, session):
         """Return the best values near a grid point."""
-        from scipy.optimize import minimize  # here, because it takes long to import
+        from scipy.optimize import minimize  # here, because its import is slow
 
         unit = self.likelihood.typical
 

@@ -1,4 +1,4 @@
-"""What a recording can determine, in tolerances, and which motion would determine the rest."""
+"""Observability of parameters by a recording, in tolerances, and motions that determine the remaining parameters."""
 
 from collections.abc import Sequence
 
@@ -46,7 +46,7 @@ def _piece_information(model, sensor, values, noise, piece):
 
 
 def _columns(layout, name, rows, piece):
-    """Return the columns of a group; zeros where the motion has no temperature or no joints, and for what a warp makes."""
+    """Return the columns of a group; zeros where the motion has no temperature or no joints, and for columns of a warp."""
     group = layout.groups.get(name)
     unknown = group is None or (piece.temperature_c is None and 'temperature' in group.uses) or (
         piece.motion is None and bool(group.uses & {'joint angle', 'joint rate'}))
@@ -57,7 +57,7 @@ def tolerance_scaled_singular_values(information: np.ndarray, tolerances: np.nda
     """
     Return the singular values of the design with parameters in units of their tolerance, descending.
 
-    A value of one means that the direction is determined to one tolerance; below one it is weak. Rank alone proves nothing.
+    A value of one means that the direction is determined to one tolerance; below one it is weak. Rank is no sufficient criterion.
     """
     scaled = information * np.outer(tolerances, tolerances)
     return np.sqrt(np.clip(scipy.linalg.eigvalsh((scaled + scaled.T) / 2)[::-1], 0, None))
@@ -88,11 +88,11 @@ def weak_directions(covariance: np.ndarray, tolerances: np.ndarray, names: Seque
 def needed_motions(solution: Solution, tolerances: np.ndarray, gravity: float, *, prior_sd: np.ndarray,
                    possible: Sequence[Motion] | None = None) -> dict[str, tuple[str, float]]:
     """
-    Return for each parameter that is not determined the standard motion that would serve it best.
+    Return for each undetermined parameter the standard motion that reduces its standard deviation most.
 
     Every motion of the catalogue is tried: its information is added, and the predicted standard errors are compared with the
     tolerances. A table that turns the sensor about one axis only can do few of them (`possible`): where none of these would help, the IMU
-    has to be mounted anew.
+    must be remounted.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def needed_motions(solution: Solution, tolerances: np.ndarray, gravity: float, *
     before, predicted = _sd_of(base), {}
     for motion in MOTIONS if possible is None else possible:
         total = base + added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=gravity)
-        predicted[motion] = _sd_of(total) * np.maximum(solution.sd / before, 1.0)   # what the model leaves out stays
+        predicted[motion] = _sd_of(total) * np.maximum(solution.sd / before, 1.0)   # the model error remains
     best = _best if possible is None else _best_on_one_joint
     return {solution.param_names[k]: best(solution, k, predicted) for k in lacking}
 

@@ -1,4 +1,4 @@
-"""Short pieces of windows by what the IMU does in them: what a calibration is judged on, apart from what it was estimated from."""
+"""Short pieces of windows by regime of motion: held-out data on which a calibration is evaluated."""
 
 from enum import StrEnum
 
@@ -16,7 +16,7 @@ AXES = 3
 
 
 class Regime(StrEnum):
-    """What the IMU does in a piece."""
+    """Regime of motion of a piece."""
 
     REST = 'rest'
     SLOW = 'slow turns'
@@ -40,8 +40,8 @@ def moving_pieces(rows: np.ndarray, time: np.ndarray, true_input: np.ndarray, *,
     """
     Return {regime: rows ``[columns | d(true input)/dt | output]``} of a moving window, a row for the mean over each piece.
 
-    The mean derivative is the difference of the true input at both ends of the piece: a delay of the sensor that the model leaves out can
-    then be told from a wrong scale.
+    The mean derivative is the difference of the true input at both ends of the piece; it separates an unmodelled delay of the sensor from a
+    wrong scale.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def moving_pieces(rows: np.ndarray, time: np.ndarray, true_input: np.ndarray, *,
     time : array, shape (n,)
         s.
     true_input, rate_s : array, shape (n, 3)
-        What the sensor is thought to have felt, and the rate of the reference, rad/s.
+        True input of the sensor according to the reference, and the rate of the reference, rad/s.
 
     """
     count = max(int((time[-1] - time[0]) / PIECE_TIME), 1)

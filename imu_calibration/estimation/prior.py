@@ -1,4 +1,4 @@
-"""What is known of the parameters before any data: priors, gauge, and parameters that least squares leaves alone."""
+"""Priors of the parameters, gauge, and parameters that least squares does not estimate."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ class Prior:
     sd: np.ndarray
     """Marginal standard deviations, shape (n_params,)."""
     gauge: np.ndarray
-    """Rows of `root` that fix an origin rather than say what is likely, shape (k, n_params)."""
+    """Rows of `root` that fix an origin and carry no information, shape (k, n_params)."""
 
 
 GAUGE_SD = 1e-12
@@ -48,5 +48,5 @@ def make_prior(model: SensorModel) -> Prior:
 
 
 def fixed_parameters(model: SensorModel) -> np.ndarray:
-    """Return a mask of parameters that least squares leaves alone (saturation is censoring, not a column)."""
+    """Return a mask of parameters that least squares does not estimate (saturation is censoring, not a column)."""
     return np.concatenate([np.full(e.size, e.coefficients is None and e.warp is None) for e in model.effects])

@@ -1,4 +1,4 @@
-"""Restricted likelihood of the means of windows as a function of the noise, beside all parameters or some of them."""
+"""Restricted likelihood of the means of windows as a function of the noise, over all parameters or some of them."""
 
 from typing import Sequence
 
@@ -23,7 +23,7 @@ class RestrictedLikelihood:
     sessions : list of ndarray
         Indices of each recording's windows in order of time.
     information : ndarray, shape (q + 1, q + 1), optional
-        Normal matrix of everything else that is known of the parameters; without it of nothing.
+        Normal matrix of the centred rows and the prior; zero by default.
 
     """
 
@@ -49,7 +49,7 @@ class RestrictedLikelihood:
 
     def scoring(self, variance: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return what Fisher scoring asks for about variances that groups of independent rows share.
+        Return score and information (Fisher scoring) of the variances of groups of independent rows.
 
         Parameters
         ----------

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 
 JITTER = 1e-12
-"""Added to the diagonal of a scaled normal matrix: above its rounding, below anything that data say."""
+"""Added to the diagonal of a scaled normal matrix: above its rounding, below the information of the data."""
 
 
 def scaled_lstsq(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -53,7 +53,7 @@ def solve_normal(normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, *, 
     normal : ndarray, shape (q + 1, q + 1)
         Products of ``[design | output]``, weighted.
     used : array of int
-        Parameters to solve for; the others are zero.
+        Parameters under estimation; the other parameters are zero.
     prior_sd, prior_mean : ndarray, shape (q,)
 
     """
@@ -64,7 +64,7 @@ def solve_normal(normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, *, 
 
 
 def quadratic(normal: np.ndarray, used: Sequence[int] | np.ndarray, values: np.ndarray) -> float:
-    """Return the sum of squares that `values` of the parameters `used` leave under a normal matrix."""
+    """Return the residual sum of squares of `values` of the parameters `used` under a normal matrix."""
     used = np.asarray(used)
     return float(normal[-1, -1] - 2 * values @ normal[used, -1] + values @ normal[np.ix_(used, used)] @ values)
 
@@ -79,7 +79,7 @@ def covariance_with_held(rows: np.ndarray, free: np.ndarray, held: np.ndarray, *
     rows : ndarray, shape (m, n)
         Weighted design, with the prior's rows where the prior of the free parameters counts.
     free, held : ndarray of bool, shape (n,)
-        Solved for, and held at the prior; parameters that are neither are certain.
+        Estimated, and fixed at the prior; parameters that are neither are certain.
     prior_sd : ndarray, shape (n,)
 
     """

@@ -1,4 +1,4 @@
-"""The noise that a session shows beside a model: first from rest alone, then from the residuals of the fit."""
+"""The noise of a session given a model: first from rest, then from the residuals of the fit."""
 
 from dataclasses import replace
 
@@ -15,13 +15,13 @@ from imu_calibration.estimation.weighted_system import WeightedSystem
 
 
 def first_noise(system: WeightedSystem, values: np.ndarray, known: dict[str, tuple[BiasProcess, ...]]) -> dict[str, NoiseModel]:
-    """Return the noise before any residual is known; fast parts wait with weight zero where slow ones can be fitted better."""
+    """Return the initial noise without residuals; fast parts have weight zero where slow parts can be fitted better."""
     return {sensor: _with_bands(system, sensor,
                                 replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))) for sensor in SENSORS}
 
 
 def updated_noise(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> dict[str, NoiseModel]:
-    """Return the noise that the residuals at `values` show."""
+    """Return the noise estimated from the residuals at `values`."""
     return {sensor: _updated(system, sensor, values, noises[sensor]) for sensor in SENSORS}
 
 
@@ -39,7 +39,7 @@ def _at_rest(system, sensor, values):
 
 
 def _with_bands(system, sensor, noise):
-    """Return the noise with weight zero for the fast parts where slow parts, each fitted alone, leave less."""
+    """Return the noise with weight zero for the fast parts where slow parts, fitted separately, have a smaller residual variance."""
     misfits = {kind: _misfit_of(system, sensor, kind) for kind in system.within[sensor]}
     return replace(noise, moving={kind: misfit.without_fast().factors(noise) for kind, misfit in misfits.items() if misfit.apart.any()})
 
@@ -55,7 +55,7 @@ def _updated(system, sensor, values, noise):
 
 
 def _judged(system, sensor, kind, values) -> BandMisfit:
-    """Return the misfit of the centred rows of a kind, with what the fast part misses along the parameters."""
+    """Return the misfit of the centred rows of a kind; of the fast part at least the misfit along the parameters."""
     misfit = _misfit_of(system, sensor, kind, values)
     if not misfit.apart.any():
         return misfit

@@ -1,4 +1,4 @@
-"""Values of effects that nobody asked for, as far as the recording asks for them; standard deviations stay those of the whole model."""
+"""Shrinkage of unrequested effects towards their prior; standard deviations remain the ones of the full model."""
 
 import numpy as np
 
@@ -12,11 +12,11 @@ SURE = 1e-9
 
 def shrunk(solution: Solution, parts: list[slice]) -> Solution:
     """
-    Return a Solution whose values of some effects go towards their prior as far as the recording does not ask for them.
+    Return a Solution in which the values of some effects are shrunk towards their prior.
 
-    By the share ``k / chi2`` of the way (James and Stein), chi2 the squared distance from the prior in standard deviations, k its
-    directions, at most all of it; the other parameters follow as if the effect had been known there. An effect that is not there costs the
-    others hardly any of their certainty then, one that is plain stays, and the standard deviations hold in both cases.
+    The factor is ``1 - k / chi2``, at least 0 (James and Stein), chi2 the squared distance from the prior in standard deviations, k its
+    number of directions. The other parameters are updated as if the effect were known at the shrunk value. An absent effect then hardly
+    raises the error of the other parameters, a significant effect is kept, and the standard deviations hold in both cases.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a solve hands back: parameters, covariance, noise, quality of the fit."""
+"""Result of a solve: parameters, covariance, noise, quality of the fit."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,10 +13,10 @@ from imu_calibration.estimation.noise_model import NoiseModel
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Estimated parameters with everything that is needed to judge them."""
+    """Estimated parameters with covariance, noise and quality of the fit."""
 
     model: SensorModel
-    """The effects, linearised where the columns were taken."""
+    """The effects, linearised at the values of the columns."""
     values: np.ndarray
     """Parameters in ``model.param_names`` order, SI, shape (n_params,)."""
     terms: Terms
@@ -28,19 +28,19 @@ class Solution:
     chi2_per_dof: dict
     """Sensor -> {'mean', 'spin', 'dynamic'} -> weighted residual sum of squares per degree of freedom."""
     information: np.ndarray
-    """Information matrix of the data alone, shape (n_params, n_params)."""
+    """Information matrix of the data without the prior, shape (n_params, n_params)."""
     residual_rms: dict
     """Sensor -> rms residual of single samples in moving windows and of window means, shape (2,)."""
     session_biases: dict = field(default_factory=dict)
     """
-    Sensor -> bias of each recording, shape (n_sessions, 3), for sensors whose bias differs from one to the next; `values` has their mean.
+    Sensor -> bias of each recording, shape (n_sessions, 3), for sensors whose bias differs between recordings; `values` has their mean.
     """
 
     model_error: ModelError | None = None
     """Allowances for misfit and drift in the covariance."""
 
     not_believed: dict[str, float] = field(default_factory=dict)
-    """Held parameter -> the value that it would have had, beyond what is known of any sensor and within what misfit can feign."""
+    """Fixed parameter -> its estimate, which exceeds the range of known sensors and is no larger than misfit can cause."""
 
     replaced: tuple[str, ...] = ()
     """Held parameters that the recording determines weakly, replaced by their prior (`covariance_terms.replace_weak`)."""

@@ -1,4 +1,4 @@
-"""Solving the system: one weighted non-linear least-squares problem over all windows, with honest standard deviations."""
+"""Solution of the system: one weighted non-linear least-squares problem over all windows, with its covariance."""
 
 from dataclasses import replace
 
@@ -22,11 +22,11 @@ from imu_calibration.estimation.weighted_system import WeightedSystem
 from imu_calibration.estimation.whitening import predict_session_offsets
 
 HELD_SHARE = 0.5
-"""A parameter whose standard deviation exceeds this share of its prior's is held at the prior."""
+"""A parameter whose standard deviation exceeds this share of its prior's is fixed at the prior."""
 NOISE_ROUNDS = 6
-"""Times that noise and parameters are estimated in turn, at most."""
+"""Largest number of alternating estimates of noise and parameters."""
 LEAVING_ROUNDS = 5
-"""Times that windows are left out which the others contradict, at most: one may hide another."""
+"""Largest number of rounds of outlier exclusion; one outlier may hide another."""
 
 
 def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool = True, prior: Prior | None = None,
@@ -43,13 +43,13 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
         Windows reduced with the columns of `model`.
     model : SensorModel
     allow_holding : bool
-        Whether parameters that the data do not determine may be held at their prior.
+        Whether parameters that the data do not determine may be fixed at their prior.
     prior : Prior, optional
-        What is known before; that of the catalogue where not given.
+        Prior of the parameters; by default the one of the catalogue.
     noise : dict, optional
-        Sensor -> NoiseModel, when it is known.
+        Sensor -> NoiseModel, if known.
     bias_processes : dict, optional
-        Sensor -> how its bias moves, where that was measured apart; the rest of the noise is estimated.
+        Sensor -> bias processes from a separate measurement; the other noise parameters are estimated.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
     Raises
     ------
     NotObservableError
-        When nothing is determined, or something is not and holding is not allowed.
+        When no parameter is determined, or one is undetermined and `allow_holding` is False.
 
     """
     if not accumulator.rows:
@@ -101,10 +101,10 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
 
 def _with_noise(system, values, noises, free):
     """
-    Return (values, noise) that were estimated in turn.
+    Return (values, noise), estimated alternately.
 
-    Mostly once is enough: the likelihood of the offsets is taken over the parameters, so it does not depend on where they stand.
-    Where slow and fast parts are weighed apart, the weights move the parameters and these the weights.
+    One round usually suffices: the likelihood of the offsets is restricted, so it does not depend on the values of the parameters.
+    With separate weights of slow and fast parts, weights and parameters depend on each other.
     """
     for _ in range(NOISE_ROUNDS):
         values = _minimised(system, values, _factors(system, noises), free, enough=0.01)
@@ -125,7 +125,7 @@ def _refuse(without, held, model, allow_holding):
 
 
 def start(system: WeightedSystem) -> np.ndarray:
-    """Return the solution of bias and matrix of each sensor alone, everything else at its prior, shape (n_params,)."""
+    """Return the solution for bias and matrix of each sensor, all other parameters at their prior, shape (n_params,)."""
     model = system.model
     values = model.start()
     values = np.where(np.isfinite(values), values, 0.0)
@@ -171,10 +171,10 @@ def _halved(system, values, step, free, factors, cost):
 
 def _undetermined(system, values, factors, free):
     """
-    Return a mask of the parameters whose standard deviation stays above a share of the prior's.
+    Return a mask of the parameters whose standard deviation exceeds a share of the prior's.
 
-    First those that the data would not show even if all others were known; then one after the other, each judged with those before it
-    held: of parameters of which only the sum is seen, one stays free.
+    First the parameters that are weak even if all other parameters were known; then one at a time, given the ones fixed before:
+    of parameters of which only the sum is observable, one stays free.
     """
     data, prior = system.jacobian(values, factors), system.prior
     jacobian = np.concatenate([data, prior.root])
@@ -184,7 +184,7 @@ def _undetermined(system, values, factors, free):
         share[left] = np.sqrt(np.diag(inverse_gram(jacobian[:, left]))) / prior.sd[left]
         if not np.any(share > HELD_SHARE):
             return held
-        # Of equals the first, whatever rounding says.
+        # The first of equal values, independent of rounding.
         held[np.argmax(share > 0.99 * share.max())] = True
 
 
@@ -218,6 +218,6 @@ def _session_biases(system, values, noises):
 
 
 def _used(system, sensor):
-    """Return how many parameters the means determine: those that concern the sensor, at most half the data."""
+    """Return how many parameters the means determine: the ones of the sensor, at most half the data."""
     own = sum(e.size for e in system.model.concerning(sensor))
     return min(own, system.means[sensor].shape[0] * 3 // 2)

@@ -1,4 +1,4 @@
-"""Standard motions of a table, each one minute long: what a recording may lack and a person can do."""
+"""Standard motions of a table, each one minute long: recommendations for the next recording."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from imu_calibration.reference.reference_motion import Reference
 from imu_calibration.reference.thermal_branch import ThermalBranch
 
 REST, WAY = 5.0, 3.0
-"""s; a rest, and what a table or a person takes from one to the next."""
+"""s; a rest, and the time from one rest to the next."""
 ALONG = 0.98
 """Cosine of the angle up to which a joint lies along a sensor axis."""
 OTHER_MOUNT = 'mount the IMU at a different angle on the joint and record the same motion again, in addition to this recording'
-"""What helps where one joint has shown what it can."""
+"""Advice when further motions of a single joint do not help."""
 
 
 @dataclass(frozen=True)
@@ -24,15 +24,15 @@ class Motion:
     name: str
     """Short name."""
     text: str
-    """What to do."""
+    """Instruction."""
     make: Callable[[float], Sequence[Reference]]
     """Function of gravity that returns pieces of the motion, each a Reference."""
     axis: tuple | None = None
-    """The one axis of the sensor that it turns about; None: it takes several, or other attitudes."""
+    """The sensor axis of the turn; None: several axes, or several attitudes."""
 
     @property
     def seconds(self) -> float:
-        """How long it takes: rests with the way to the next one, and what moves."""
+        """Duration: rests with the move to the next one, and moving pieces."""
         return sum(REST + WAY if len(piece) == 1 else float(piece.time[-1] - piece.time[0]) + WAY for piece in self.make(STANDARD_GRAVITY))
 
 
@@ -60,7 +60,7 @@ def _attitudes(up_s):
 
 TIME = np.arange(0.0, 30.0, 0.02)
 SHAKEN = 0.05
-"""Variance of a vibration that a bench machine leaves in the band, (m/s^2)^2."""
+"""Residual variance of a machine's vibration in the band, (m/s^2)^2."""
 
 
 EDGES = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
@@ -165,7 +165,7 @@ def motions_about(axis_s: np.ndarray, up_s: np.ndarray) -> tuple[Motion, ...]:
     """
     Return the motions of a table that turns the sensor about one axis only: none where that is no axis of the sensor.
 
-    Gravity stands to the axis as it does on the table: about a vertical one the sensor never sees it turn.
+    Gravity has the same direction relative to the axis as on the table: for a vertical axis it is constant in the sensor frame.
 
     Parameters
     ----------
@@ -196,4 +196,4 @@ ONE_JOINT = {
     'warm_and_cool': 'rest in several places while it warms up by ten kelvins, and again while it cools',
     'shake': 'rest in several places, quiet and while a machine shakes the table',
 }
-"""What a table of one joint can do of them; for the others the sensor is mounted anew."""
+"""The motions that a table of one joint can do; the other ones require a remounted IMU."""

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 BLOCK = 2000
-"""Rows per orthogonal factorisation: taller blocks do not stay in the processor's cache."""
+"""Rows per orthogonal factorisation: taller blocks do not fit in the processor's cache."""
 PANEL = 4
 """Columns that are reflected at a time."""
 
@@ -16,7 +16,7 @@ def triangular(rows: np.ndarray) -> np.ndarray:
         return _r_factor(np.array(rows, order='F'))
     factor = np.zeros((width, width), order='F')
     for start in range(0, count, BLOCK):
-        # Each block is folded into the triangle, whose zeros cost nothing.
+        # Each block is folded into the triangle, whose zeros are skipped.
         block = np.array(rows[start:start + BLOCK], order='F')
         factor, _, _, info = lapack.dtpqrt(0, min(PANEL, width), factor, block, overwrite_a=1, overwrite_b=1)
         _require_finite(info, factor)

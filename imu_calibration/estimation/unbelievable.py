@@ -1,4 +1,4 @@
-"""Values that nobody should believe: beyond what is known of any sensor, and no larger than what misfit of the model could feign."""
+"""Implausible values: beyond the range of known sensors, and no larger than an error caused by model misfit."""
 
 import numpy as np
 
@@ -10,24 +10,24 @@ FAR = 3.0
 """Prior standard deviations beyond which an entry of a matrix needs a reason that is not misfit."""
 
 NOISE = 1.1
-"""Residuals up to this times the variance at rest are noise: what it was estimated from may have been a little quieter."""
+"""Residuals up to this times the variance at rest are noise: the rest used for its estimate may have been quieter."""
 
 
 def unbelievable(system: WeightedSystem, values: np.ndarray, *, sd: np.ndarray, noises: dict[str, NoiseModel],
                  free: np.ndarray) -> np.ndarray:
     """
-    Return a mask of the parameters whose information may come through misfit alone.
+    Return a mask of the parameters whose information may be an artefact of misfit.
 
-    The value lies beyond what is known of any instrument, and if all misfit of moving windows that noise does not explain lay along the
-    parameter, it would move it as far. An accelerometer's scale along an axis that never saw gravity lives on what little the arms and
-    wrong angles bring there; a gyroscope at the wrong full-scale setting does not fit by misfit, and keeps its value. An effect is held as
-    a whole, of a matrix single entries.
+    The value exceeds the range of known instruments, and it is no larger than the shift that all excess misfit of moving windows causes
+    along the parameter. Example: an accelerometer's scale along an axis without gravity, determined only through arms and wrong angles.
+    A gyroscope at the wrong full-scale setting has a value larger than its misfit explains, and is kept. All parameters of an effect are
+    fixed, of a matrix single entries.
 
     Parameters
     ----------
     system : WeightedSystem
     values, sd : ndarray, shape (n_params,)
-        The estimate and what noise alone leaves open.
+        The estimate and its standard deviation from noise.
     noises : dict
         Sensor -> NoiseModel.
     free : ndarray of bool, shape (n_params,)
@@ -51,7 +51,7 @@ def _limit(effect: Effect) -> float:
 
 
 def _feigned(system, sensor, values, noise):
-    """Return by how many standard deviations of noise all unexplained misfit of moving windows could move a parameter of the worst axis."""
+    """Return the largest shift, in sds of noise, of a parameter of the worst axis by all excess misfit of moving windows."""
     rested = any(row.kind == 'static' for row in system.accumulator.rows)
     rest = NOISE * np.maximum(noise.low_variance, noise.white_variance) if rested else 0.0
     total = np.zeros(3)

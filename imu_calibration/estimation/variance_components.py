@@ -23,7 +23,7 @@ UPPER = 0.975
 
 @dataclass(frozen=True, eq=False)
 class GroupVariances:
-    """Variances beside the known noise."""
+    """Variances in addition to the known noise."""
 
     variance: np.ndarray
     """Additional variance of each group, shape (n_groups,)."""
@@ -66,7 +66,7 @@ def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np
     start : array, shape (n_groups,)
         First guess of the variances.
     fallback : array, shape (n_groups,)
-        Variance taken for a group with fewer than two degrees of freedom.
+        Variance of a group with fewer than two degrees of freedom.
 
     """
     rows = np.column_stack([design, residual])[:, None]

@@ -1,4 +1,4 @@
-"""The rows of one solve: accumulated windows with the columns of a model, weighed with a noise, and the prior."""
+"""The rows of one solve: accumulated windows with the columns of a model, weighted by a noise model, and the prior."""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -16,12 +16,12 @@ from imu_calibration.estimation.triangular import triangular
 from imu_calibration.estimation.whitening import Whitening
 
 LOOSE = 1e3
-"""How many times as uncertain as any other a mean is that does not count."""
+"""Sd factor of an excluded mean over the largest sd of all means."""
 
 
 class WeightedSystem:
     """
-    Accumulated windows as rows ``[columns | output]``, and what follows from them for values of the parameters and a noise.
+    Accumulated windows as rows ``[columns | output]``, with residuals and derivatives for given parameters and noise.
 
     Parameters
     ----------
@@ -75,9 +75,9 @@ class WeightedSystem:
 
     def mean_variance(self, noise: NoiseModel, beside_bias: bool = True) -> np.ndarray:
         """
-        Return the variance of the window means, of those left out beyond all others', shape (n_windows, 3).
+        Return the variance of the window means, very large for excluded windows, shape (n_windows, 3).
 
-        Beside the bias in the middle of each window, or by the noise within and the reference alone.
+        Relative to the bias in the middle of each window, or of the noise within windows and of the reference only.
         """
         variance = (noise.variance_beside_bias if beside_bias else noise.mean_variance)(self.kinds, self.counts, self.durations,
                                                                                             keys=self.keys)
@@ -129,9 +129,9 @@ class WeightedSystem:
     def weighed_rows(self, sensor: str, noise: NoiseModel,
                      part: Accumulator | WindowBlock | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """
-        Yield (centred rows, weight of each axis (3,)): all of each kind, and once more the slow ones where these count for more.
+        Yield (centred rows, weight of each axis (3,)): all rows of each kind, and again the slow ones where these have more weight.
 
-        Of all windows, or those of a block.
+        From all windows, or from one block.
         """
         part = part or self.accumulator
         for kind in self.within[sensor]:
@@ -142,7 +142,7 @@ class WeightedSystem:
                 yield part.slow[sensor, kind], extra
 
     def residuals(self, values: np.ndarray, factors: dict) -> np.ndarray:
-        """Return the residual rows of both sensors and all axes, those of the prior last."""
+        """Return the residual rows of both sensors and all axes, the prior's rows last."""
         parts = []
         for sensor in SENSORS:
             c = coefficients(self.model, sensor, values)
@@ -159,9 +159,9 @@ class WeightedSystem:
 
     def linearised(self, sensor: str, values: np.ndarray, noise: NoiseModel) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return mean rows in coordinates of the parameters of one sensor, and what else is known of them.
+        Return mean rows in coordinates of the parameters of one sensor, and the normal matrix of centred rows and prior.
 
-        Directions that the gauge fixes are no coordinates: beside their weight in a normal matrix nothing else would be seen.
+        Directions fixed by the gauge are excluded: their weight would dominate the normal matrix.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Means of windows whose errors are correlated in time, turned into independent rows of unit variance, in linear time."""
+"""Whitening of window means with errors correlated in time: independent rows of unit variance, in linear time."""
 
 from typing import Sequence
 
@@ -13,7 +13,7 @@ class Whitening:
     Multiplication with the inverse Cholesky factor of the covariance of window means, by the innovations of a Kalman filter.
 
     The covariance is ``diag(variance) + sum_j sd_j^2 exp(-|dt| / time_j)`` within a session, the sum over any number of bias processes,
-    each a state of the filter. An offset of each session is taken out afterwards with ``(I + s^2 u u')^(-1/2)``, u the whitened ones.
+    each a state of the filter. An offset of each session is then removed with ``(I + s^2 u u')^(-1/2)``, u the whitened ones.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def _gains(variance, decay, fresh):
 
 def _gains_of_one(variance, decay, fresh):
     """
-    Return the same for one process, the common case, which is asked for hundreds of times.
+    Return the same for one process, the common case (called hundreds of times).
 
     Differences ``y_k - decay_k y_(k-1)`` have a tridiagonal covariance, whose pivots are the variances of the innovations.
     """

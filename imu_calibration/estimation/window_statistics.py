@@ -1,4 +1,4 @@
-"""One window of data, reduced to what least squares needs of it."""
+"""One window of data, reduced to its statistics for least squares."""
 
 from dataclasses import dataclass, field
 from typing import Callable, Sequence
@@ -16,9 +16,9 @@ from imu_calibration.samples import rounding_variance
 from imu_calibration.segmentation.window import Window
 
 SLOW_TIME = 0.25
-"""Length of the pieces whose means tell correlated misfit from white noise, s: longer than sensor filters, shorter than motions."""
+"""Length of the pieces whose means separate correlated misfit from white noise, s: longer than sensor filters, shorter than motions."""
 BATCHES = 16
-"""Pieces of a window at rest whose means give the noise at low frequency."""
+"""Pieces of a window at rest whose means determine the noise at low frequency."""
 BATCH_DOF = 2 * (BATCHES - 1)**2 / (3 * BATCHES - 4)
 """Degrees of freedom of that estimate: differences of neighbours are correlated (von Neumann)."""
 
@@ -26,10 +26,10 @@ BATCH_DOF = 2 * (BATCHES - 1)**2 / (3 * BATCHES - 4)
 @dataclass(frozen=True, eq=False)
 class SensorStatistics:
     """
-    The rows ``[columns | output]`` of one sensor in one window, split in mean and rest.
+    The rows ``[columns | output]`` of one sensor in one window, split into mean row and centred rows.
 
-    The mean row carries a random offset of the window (of its bias) beside the averaged noise; the centred rows do not.
-    Weighted apart, the two are an exact summary for the model ``output = columns @ coefficients + window offset + noise``.
+    The mean row has a random offset of the window (of its bias) in addition to the averaged noise; the centred rows have none.
+    With separate weights, the two are an exact summary for the model ``output = columns @ coefficients + window offset + noise``.
     """
 
     mean: np.ndarray
@@ -42,10 +42,10 @@ class SensorStatistics:
     """Variance of batch means over that of white noise of the same variance, shape (3,); NaN when not static."""
     slow: np.ndarray | None = None
     """
-    Triangular factor of the centred means of SLOW_TIME pieces, times the root of their length; its misfit shows what white noise does not.
+    Triangular factor of the centred means of SLOW_TIME pieces, times the root of their length; for the test of correlated misfit.
     """
     slow_rows: int = 0
-    """Number of those pieces."""
+    """Number of these pieces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class WindowStatistics:
     sensors: dict[str, SensorStatistics]
     """Sensor name -> SensorStatistics."""
     session: int = 0
-    """Recording that the window comes from."""
+    """Recording of the window."""
     encoder_step: float = 0.0
     """Largest step of the encoders that shows in the readings, rad; 0 where none does."""
     pieces: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
@@ -73,7 +73,7 @@ class WindowStatistics:
 def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, *, session: int = 0,
                    column_function: Callable = columns, with_pieces: bool = False) -> list[WindowStatistics]:
     """
-    Reduce windows to their statistics, their columns worked out in one go.
+    Reduce windows to their statistics; the columns of all windows are computed in one call.
 
     Parameters
     ----------
@@ -84,11 +84,11 @@ def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, 
     table : Table
         Reference kinematics.
     session : int
-        Recording that the windows come from.
+        Recording of the windows.
     column_function : callable
         Same signature as `effects.columns.columns`.
     with_pieces : bool
-        Keep the short pieces that a proof is made on.
+        Keep the short pieces for held-out evaluation.
 
     """
     motion, temperature = joined_motion(windows)
@@ -164,7 +164,7 @@ def batch_statistics(output: np.ndarray, batches: int = BATCHES) -> tuple[np.nda
     Return the variance of each column and the factor by which means of it scatter more than white noise.
 
     The factor is the variance of the means of `batches` equal pieces, times their length, over the sample variance:
-    a sensor's low-pass filter makes it larger than one. Pieces rather than the whole keep slow drift out.
+    a sensor's low-pass filter makes it larger than one. Pieces exclude slow drift.
     """
     variance = output.var(axis=0, ddof=1)
     length = len(output) // batches

@@ -1,4 +1,4 @@
-"""A bounded store of windows, for effects that must be linearised anew without reading the recording again."""
+"""A bounded store of windows, for effects that are linearised again without a second pass over the recording."""
 
 from dataclasses import replace
 from typing import Iterator
@@ -21,7 +21,7 @@ class WindowStore:
     """
     All windows of a session as long as they fit, none of them afterwards.
 
-    A static window is its reduced form with one row of motion; of others every sample is kept.
+    A static window is stored as its reduced form with one row of motion; of other windows every sample is kept.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class WindowStore:
         return twin
 
     def add(self, window: Window, reduced: WindowStatistics) -> None:
-        """Take one window in memory of its own (`owned_window`), and its statistics; when it does not fit, forget them all."""
+        """Add a copy of one window (`owned_window`), and its statistics; when it does not fit, discard all windows."""
         if not self.complete:
             return
         if window.kind == 'static':
@@ -66,7 +66,7 @@ class WindowStore:
 
 
 def _again(entry, model, table):
-    """Return a static window's statistics with the columns taken anew."""
+    """Return a static window's statistics with recomputed columns."""
     reduced, motion, temperature = entry
     sensors = {name: replace(known, mean=np.concatenate([columns(model, name, table, motion=motion, temperature_c=temperature).mean(axis=0),
                                                          known.mean[-3:]]))
@@ -75,7 +75,7 @@ def _again(entry, model, table):
 
 
 def owned_window(window: Window) -> Window:
-    """Return the window in memory of its own: slices would keep the whole chunk that they were cut from."""
+    """Return a copy of the window in separate memory: slices would keep the complete chunk in memory."""
     motion = JointMotion.joined([window.motion])
     temperature = None if window.temperature_c is None else np.array(window.temperature_c)
     return Window(window.kind, window.stamp_ns.copy(), window.time.copy(), window.force_s.copy(), window.rate_s.copy(), motion, temperature,
