@@ -1,4 +1,4 @@
-"""Blocks of a recording or of live topics, cleaned once for everybody who looks at them: checks, windows, statistics of the streams."""
+"""Blocks of a recording or of live topics, cleaned once for all consumers: checks, windows, statistics of the streams."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from imu_calibration.segmentation.stream_cleaning import StreamCheck, StreamStat
 
 STREAMS = ('imu', 'joints', 'temperature')
 MESSAGES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
-"""Stream -> what people call its messages; reasons for which one was lost begin with that."""
+"""Stream -> message type; names of reasons for lost messages begin with it."""
 BATCH = 200
 """Samples that are cleaned together: cleaning has a fixed cost per call."""
 _KINDS: dict[str, Any] = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
@@ -19,12 +19,12 @@ _KINDS: dict[str, Any] = {'imu': ImuSamples, 'joints': JointSamples, 'temperatur
 
 @dataclass(frozen=True, eq=False)
 class CleanedBlock:
-    """What is usable of one or several blocks: per stream (epoch of the clock, samples), ... in order."""
+    """Usable samples of one or several blocks: per stream (epoch of the clock, samples), ... in order."""
 
     imu: Sequence[tuple[int, ImuSamples]] = ()
     """SI."""
     joints: Sequence[tuple[int, JointSamples]] = ()
-    """In the order of names that was asked for."""
+    """In the requested order of names."""
     temperature: Sequence[tuple[int, TemperatureSamples]] = ()
     """Degrees Celsius."""
 
@@ -33,27 +33,27 @@ class CleanedBlock:
 
 
 class Watcher(Protocol):
-    """Somebody who looks at a stream of cleaned blocks."""
+    """Observer of a stream of cleaned blocks."""
 
     def push(self, cleaned: CleanedBlock) -> object:
-        """Take what follows."""
+        """Process the next block."""
 
     def finish(self, cleaner: 'BlockCleaner') -> object:
-        """Take note that the streams are over; may raise when they cannot be used."""
+        """Process the end of the streams; may raise when they cannot be used."""
 
 
 class BlockCleaner:
     """
-    Brings the streams of a session to SI and one order of joints, and drops what cannot be used (see `StreamCheck`).
+    Converts the streams of a session to SI and one order of joints, and drops unusable samples (see `StreamCheck`).
 
     Parameters
     ----------
     joint_names : sequence of str
-        Order of the joints; without it they stay as they come.
+        Order of the joints; by default unchanged.
     nominal : NominalScaling, optional
         For recordings in volts or counts.
     watchers : sequence of Watcher
-        Who sees each cleaned block as well.
+        Receivers of each cleaned block.
 
     """
 
@@ -63,9 +63,9 @@ class BlockCleaner:
         self._raw: dict[str, list] = {name: [] for name in STREAMS}
         self._ready: dict[str, list[tuple[int, Any]]] = {name: [] for name in STREAMS}
         self.lost: dict[str, int] = {}
-        """Messages that could not be turned into samples: reason -> count."""
+        """Messages that could not be converted to samples: reason -> count."""
         self.notes: dict[str, int] = {}
-        """Messages that were used in another way than they came: reason -> count."""
+        """Messages that were used with a modification: reason -> count."""
 
     @property
     def n_buffered(self) -> int:
@@ -75,12 +75,12 @@ class BlockCleaner:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Return what was dropped of which stream: 'imu not finite', 'joints repeated stamp', ... -> number of samples."""
+        """Return the dropped samples per stream: 'imu not finite', 'joints repeated stamp', ... -> number of samples."""
         self._clean()
         return {f'{name} {reason}': count for name, check in self._checks.items() for reason, count in check.counts.items()}
 
     def epoch(self, stream: str) -> int:
-        """Return how often the clock of a stream was set anew."""
+        """Return how often the clock of a stream was reset."""
         return self._checks[stream].epoch
 
     def statistics(self, gap: float = 0.1) -> dict[str, StreamStatistics]:
@@ -91,17 +91,17 @@ class BlockCleaner:
 
     @property
     def stamping(self) -> StampLine | None:
-        """How the stamps of the IMU are; None while too few came to tell."""
+        """Regularity of the IMU stamps; None until enough stamps have been received."""
         return self._checks['imu'].line
 
     def push(self, block: SampleBlock) -> CleanedBlock:
         """
-        Take a block and return what is usable by now; of small blocks nothing before `BATCH` samples came.
+        Add a block and return the samples usable now; small blocks are collected up to `BATCH` samples.
 
         Raises
         ------
         InputError
-            When the joints of the block are not those that were asked for.
+            When the joints of the block differ from the requested ones.
 
         """
         for found, total in ((block.dropped, self.lost), (block.notes, self.notes)):
@@ -117,7 +117,7 @@ class BlockCleaner:
         return self._hand_on()
 
     def finish(self) -> CleanedBlock:
-        """Return what was held; after this nothing more may be pushed."""
+        """Return the buffered samples; no block may be added after this."""
         self._clean()
         for name, check in self._checks.items():
             self._ready[name] += check.finish()
@@ -127,7 +127,7 @@ class BlockCleaner:
         return cleaned
 
     def all_of(self, blocks: Iterable[SampleBlock]) -> Iterator[CleanedBlock]:
-        """Yield what is usable of a whole recording."""
+        """Yield the usable samples of a recording."""
         for block in blocks:
             yield self.push(block)
         yield self.finish()

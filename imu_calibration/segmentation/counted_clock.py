@@ -1,4 +1,4 @@
-"""A clock drawn through stamps that follow it only loosely: samples are counted, those that were lost included."""
+"""A clock fitted to loosely related stamps: samples are numbered, including the lost ones."""
 
 import numpy as np
 
@@ -7,9 +7,9 @@ from imu_calibration.segmentation.stamping import LAG, LATE, PAUSE_NS, StampLine
 BLOCK = LAG
 """Samples that give one point of the clock."""
 REACH = 32
-"""Samples on both sides of a long step that tell whether samples were lost there or came late; packets are smaller."""
+"""Samples on both sides of a long step that decide between lost and late samples; packets are smaller."""
 LOST = 0.6
-"""A clock that is ahead by more than this share of a period behind a long step than before it has lost samples there."""
+"""Samples were lost at a long step if the clock is ahead by more than this share of a period after it, relative to before."""
 FOLLOW = 0.05
 """A period that has changed by more than this share is another one; smaller changes are averaged."""
 SLOW = 0.1
@@ -18,15 +18,15 @@ SLOW = 0.1
 
 class CountedClock:
     """
-    Times of samples from their stamps, in order: each block of 64 gives one point, the times lie on the straight lines between them.
+    Times of samples from their stamps, in order: each block of 64 gives one point; the times are interpolated linearly between points.
 
-    The points are those of the earliest stamps where stamps are times of arrival, which can only be late, else the means. What comes out
-    does not depend on how the stamps are cut.
+    The points are those of the earliest stamps where stamps are times of arrival, which can only be late, otherwise the means. The
+    result does not depend on the division of the stamps into blocks.
 
     Parameters
     ----------
     line : StampLine
-        What is known of the stamps so far.
+        Current estimate of the relation of the stamps to the sampling.
 
     """
 
@@ -37,7 +37,7 @@ class CountedClock:
         self._begin()
 
     def _begin(self) -> None:
-        """Forget the past, but for the period."""
+        """Reset everything except the period."""
         self._origin_ns: int | None = None
         self._next = 0.0
         self._before = np.zeros((2, 0))
@@ -45,11 +45,11 @@ class CountedClock:
         self._points: list[tuple[float, float]] = []
 
     def push(self, stamp_ns: np.ndarray) -> None:
-        """Take stamps in the order of arrival."""
+        """Add stamps in the order of arrival."""
         self._raw = np.concatenate([self._raw, stamp_ns])
 
     def take(self, final: bool = False) -> np.ndarray:
-        """Return the times that are known now (all with `final`), int64, ns, in the order of the stamps."""
+        """Return the times that are determined now (all with `final`), int64, ns, in the order of the stamps."""
         while len(self._raw) >= BLOCK + REACH or (final and len(self._raw)):
             pause = np.flatnonzero(np.diff(self._raw[:BLOCK + REACH]) > PAUSE_NS)
             end = len(self._raw) if not len(pause) else int(pause[0]) + 1
@@ -63,7 +63,7 @@ class CountedClock:
         return times
 
     def _work(self, stamp_ns: np.ndarray, ahead_ns: np.ndarray) -> None:
-        """Number a block, take its point, and tell the times of the block before it."""
+        """Number a block, compute its point, and compute the times of the block before it."""
         if self._origin_ns is None:
             self._origin_ns = int(stamp_ns[0])
         stamp = (np.concatenate([stamp_ns, ahead_ns]) - self._origin_ns).astype(float)
@@ -81,7 +81,7 @@ class CountedClock:
         self._block = number
 
     def _numbered(self, stamp: np.ndarray, count: int) -> np.ndarray:
-        """Return the numbers of the first `count` samples: one more each, and as many more as were lost behind a long step."""
+        """Return the numbers of the first `count` samples: increments of one, plus the number of samples lost at a long step."""
         middle = np.min if self._arrivals else np.median
         number = self._next + np.arange(len(stamp))
         step = np.diff(stamp, prepend=self._before[1, -1] if self._before.shape[1] else stamp[0])
@@ -93,7 +93,7 @@ class CountedClock:
         return number[:count]
 
     def _tell(self, number: np.ndarray) -> None:
-        """Tell the times of a block, from the points of its neighbours and its own."""
+        """Compute the times of a block, from its point and the points of its neighbours."""
         points = np.array(self._points)
         ends = (points[0] - (BLOCK, BLOCK * self._period), points[-1] + (BLOCK, BLOCK * self._period))
         points = np.vstack([ends[0], points, ends[1]])
@@ -101,7 +101,7 @@ class CountedClock:
         self._times.append(self._origin_ns + np.rint(times).astype(np.int64))
 
     def _follow(self) -> None:
-        """Bring the period up to date; keep the last two points."""
+        """Update the period; keep the last two points."""
         if len(self._points) < 2:
             return
         (n0, t0), (n1, t1) = self._points[-2:]
@@ -110,7 +110,7 @@ class CountedClock:
         self._points = self._points[-2:]
 
     def _finish(self) -> None:
-        """Tell what is left, and forget."""
+        """Compute the remaining times, and reset."""
         if self._block is not None:
             self._tell(self._block)
         self._begin()

@@ -1,4 +1,4 @@
-"""When the joints stand, turn steadily or change their rate, seen in noisy or quantised readings."""
+"""Phases of the joints (rest, steady turn, changing rate) from noisy or quantised readings."""
 
 from enum import IntEnum
 
@@ -11,16 +11,16 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 
 
 class Phase(IntEnum):
-    """What the joints do at a reading."""
+    """Phase of the joints at a reading."""
 
     STILL = 0
     """All of them rest."""
     STEADY = 1
     """All rates are constant, and one joint turns."""
     MOVING = 2
-    """Anything else that moves."""
+    """Any other motion."""
     LOST = 3
-    """They are not known."""
+    """Unknown."""
 
 
 STILL, STEADY, MOVING, LOST = Phase
@@ -29,16 +29,16 @@ RATE_SPAN = 0.2
 LONGEST_SPAN = 1.0
 """A rest or a steady turn must show over this time (or the shortest window, if that is less), s."""
 REACH = RATE_SPAN / 2 + LONGEST_SPAN
-"""Readings further away than this do not change a phase, s."""
+"""Readings at a larger distance do not change a phase, s."""
 
 
 def joint_phases(time: np.ndarray, position: np.ndarray, settings: WindowSettings, *,
                  noise_rad: float | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
-    Tell the phase of each joint reading of a stretch without gaps.
+    Return the phase of each joint reading of a stretch without gaps.
 
-    At rest: every slope over 0.2 s, and some slope over a second that contains the reading, is below `static_rate` plus what
-    noise and encoder steps can feign (four standard deviations; 1.5 steps over the span). Steady: within some second that
+    At rest: every slope over 0.2 s, and at least one slope over a second that contains the reading, is below `static_rate` plus errors of
+    noise and encoder steps (four standard deviations; 1.5 steps over the span). Steady: within at least one second that
     contains the reading the rates over 0.2 s change by less than `spin_rate_variation` of their middle, or by less than `static_rate`,
     and the readings show no ripple about them.
 
@@ -81,7 +81,7 @@ def joint_phases(time: np.ndarray, position: np.ndarray, settings: WindowSetting
 def _resolution(rows, noise_rad):
     """Return the step of the encoders and the noise of the readings, both (n_joints,), rad."""
     step = np.array([encoder_step(row) for row in rows])
-    # the lower quartile: readings at rest, where they are a quarter of all, have neither jitter nor jerk in them
+    # the lower quartile: if a quarter of the readings are at rest, it contains neither jitter nor jerk
     return step, np.maximum(noise_rad or 0.0, _white_noise(rows, 0.25))
 
 
@@ -125,7 +125,7 @@ def _widened(mask, half):
 
 
 def _slopes(time, rows, half):
-    """Return least-squares slopes and means over ``2 half + 1`` readings, fewer at the ends, and what the readings differ from them."""
+    """Return least-squares slopes and means over ``2 half + 1`` readings, fewer at the ends, and the residuals of the readings."""
     n = len(time)
     half = min(half, n - 1)
     place = np.arange(n)

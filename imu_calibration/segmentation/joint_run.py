@@ -1,4 +1,4 @@
-"""A stretch of joint readings without gaps: what the joints do between them, and the curve through them."""
+"""A stretch of joint readings without gaps: phases between the readings, and a smooth curve through them."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from imu_calibration.segmentation.joint_phases import MOVING, STILL, joint_phase
 from imu_calibration.segmentation.window_settings import WindowSettings
 
 LEAST_READINGS = 4
-"""Fewer say too little about the motion."""
+"""Fewest readings for an estimate of the motion."""
 
 
 class JointRun:
@@ -22,14 +22,14 @@ class JointRun:
         self.step = np.array([encoder_step(column) for column in position.T])
 
     def covered(self, time: np.ndarray, before: bool, after: bool) -> np.ndarray:
-        """Tell which instants lie between the readings or, where the joints rest, within two periods of the first or last."""
+        """Return a mask of the instants between the readings or, where the joints rest, within two periods of the first or last."""
         reach = 2 * np.median(np.diff(self.time))
         low = self.time[0] - (reach if before and self.phase[0] == STILL else 0.0)
         high = self.time[-1] + (reach if after and self.phase[-1] == STILL else 0.0)
         return (time >= low) & (time <= high)
 
     def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the phase (that of both neighbours, else moving) and the level at instants."""
+        """Return the phase (if equal at both neighbours, otherwise moving) and the level at instants."""
         right = np.minimum(np.searchsorted(self.time, time), len(self.time) - 1)
         left = np.maximum(right - 1, 0)
         phase = np.where(self.phase[left] == self.phase[right], self.phase[right], MOVING)
@@ -37,7 +37,7 @@ class JointRun:
         return phase.astype(np.int8), level
 
     def near_motion(self, time: np.ndarray, distance: float) -> np.ndarray:
-        """Tell which instants between the readings are within `distance` of one with moving joints."""
+        """Return a mask of the instants between the readings that are within `distance` of one with moving joints."""
         if not len(self._moving):
             return np.zeros(len(time), bool)
         right = np.searchsorted(self._moving, time)

@@ -1,4 +1,4 @@
-"""When the IMU is quiet: short-time variance against the lowest that the recording shows; free of scale, so counts will do."""
+"""Detection of a quiet IMU: short-time variance against the lowest of the recording; independent of scale, so counts are allowed."""
 
 from collections import deque
 
@@ -6,13 +6,13 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 SPANS = (0.25, 1.0)
-"""Variances are taken over these times, s: the short one sees a knock, the long one a slow swing."""
+"""Variances are computed over these times, s: the short one detects a knock, the long one a slow swing."""
 REACH = 1.3
-"""Samples further away than this do not change quietness, s."""
+"""Samples at a larger distance do not change quietness, s."""
 BELOW = 0.1
-"""Vibration is what means over this time, taken three times over, do not show, s: some 8 Hz and more."""
+"""Vibration is the part removed by three running means over this time, s: above about 8 Hz."""
 STEADY = 0.75
-"""Vibration is steady when it is not above the quiet ratio of its least within this time on both sides, s; a knock is."""
+"""Vibration is steady when it is not above the quiet ratio of its minimum within this time on both sides, s; a knock is not steady."""
 _LEAST_SAMPLES = 10
 _GRID = 0.01  # s: spans begin and end on this grid, or at every sample of a slow IMU
 _GROWTH = 2.0
@@ -26,7 +26,7 @@ class QuietFloor:
         self._history = {}
 
     def update(self, key: float, value: np.ndarray | None) -> np.ndarray | None:
-        """Add the floor of one chunk (None: nothing was at rest) and return the running one, or None."""
+        """Add the floor of one chunk (None: no rest) and return the running one, or None."""
         history = self._history.setdefault(key, deque(maxlen=9))
         if value is not None:
             history.append(value)
@@ -36,10 +36,10 @@ class QuietFloor:
 def quiet_beside_joints(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, ratio: float, longest: float,
                         floors: tuple[QuietFloor, QuietFloor], resting: np.ndarray) -> np.ndarray:
     """
-    Tell which samples lie in a quiet span, or in a vibration of a table whose joints stand.
+    Return a mask of the samples in a quiet span, or in a vibration of a table with resting joints.
 
-    Joints that stand tell rest where the IMU cannot: a vibration is steady, and nothing of it is left in means over a tenth of a second,
-    which are as quiet as ever. A hand, a shove and a slow turn are left in them; a knock is not steady.
+    Resting joints imply rest where the IMU vibrates: a vibration is steady, and means over a tenth of a second are as quiet as without
+    it. A hand, a shove and a slow turn change these means; a knock is not steady.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def low_passed(values: np.ndarray, width: int) -> np.ndarray:
 
 
 def _steady(force_s, rate_s, period, *, ratio, resting):
-    """Tell which samples lie in a short span at rest whose variance is about the least of the spans around."""
+    """Return a mask of the samples in a short span at rest whose variance is about the minimum of the spans around."""
     cell = max(1, min(int(_GRID / period), len(force_s)))
     edges = np.append(np.arange(0, len(force_s) - cell + 1, cell), len(force_s))
     width = min(max(int(np.ceil(_LEAST_SAMPLES / cell)), int(round(SPANS[0] / period / cell))), len(edges) - 1)
@@ -88,7 +88,7 @@ def _steady(force_s, rate_s, period, *, ratio, resting):
 def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, ratio: float, longest: float, floor: QuietFloor,
                   resting: np.ndarray | None = None, spans: tuple[float, ...] = SPANS) -> np.ndarray:
     """
-    Tell which samples lie in a quiet span.
+    Return a mask of the samples in a quiet span.
 
     A span is quiet when the variances of specific force and of angular rate, summed over the axes, are below ``ratio^2``
     times their floors; a sample is quiet when some quiet span of each length contains it.
@@ -106,7 +106,7 @@ def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, rat
     floor : QuietFloor
         Running floor, updated here.
     resting : array of bool, shape (n,), optional
-        Samples with the joints at rest; the floor comes from spans within them. None: from the quietest tenth of all.
+        Samples with the joints at rest; the floor is computed from spans within them. None: from the quietest tenth of all.
     spans : tuple of float
         Lengths of the spans, s.
 
@@ -128,11 +128,11 @@ def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, rat
         limit = floor.update(span, _chunk_floor(variance, width, at_rest))
         if limit is None and np.isinf(shorter).all():
             return np.zeros(n, bool)
-        # at rest the variance hardly grows with the span; where it does, the quietest part was moving as well
+        # at rest the variance hardly grows with the span; otherwise the quietest part was moving as well
         shorter = limit = np.maximum(shorter if limit is None else np.minimum(limit, _GROWTH * shorter), least)
         calm = np.all(variance <= ratio ** 2 * limit, axis=1)
         quiet &= _covered(calm, width)
-        if width > 1 and resting is None:   # from one sample to the next into another attitude: no quiet span goes across
+        if width > 1 and resting is None:   # a change of attitude between two samples: no quiet span contains it
             across = _covered(calm, width - 1)
             quiet[:-1] &= across
             quiet[1:] &= across
@@ -148,13 +148,13 @@ def _chunk_floor(variance, width, at_rest):
 
 
 def _free_of(busy, width):
-    """Return for the span of `width` cells from each cell on whether none of them is busy."""
+    """Return whether the span of `width` cells from each cell on has no busy cell."""
     sums = np.concatenate([[0], np.cumsum(busy)])
     return sums[width:] == sums[:-width]
 
 
 def least_variance(values: np.ndarray) -> float:
-    """Return the variance, axes added, below which nothing counts: that of half a converter step, or of 1e-5 of the readings."""
+    """Return the least variance, summed over axes: of half a converter step, or of 1e-5 of the readings."""
     some = np.ascontiguousarray(values[:4000].T)
     change = np.abs(np.diff(some, axis=1))
     step = np.where(change > 0, change, np.inf).min(axis=1, initial=np.inf)
@@ -194,7 +194,7 @@ def _covered(calm, width):
 
 
 def _shrunk(mask, margin):
-    """Return `mask` without the cells that are within `margin` cells of one that is not in it."""
+    """Return `mask` without the cells within `margin` cells of a False one."""
     sums = np.concatenate([[0], np.cumsum(~mask)])
     cell = np.arange(len(mask))
     return sums[np.minimum(cell + margin + 1, len(mask))] == sums[np.maximum(cell - margin, 0)]

@@ -1,4 +1,4 @@
-"""Samples waiting to be used."""
+"""Buffered samples."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ class SampleBuffer:
         return sum(len(block) for block in self._blocks)
 
     def add(self, samples: ImuSamples | JointSamples | TemperatureSamples) -> None:
-        """Append samples, all newer than those before."""
+        """Append samples; all stamps must exceed the buffered ones."""
         if len(samples):
             self.newest_ns = int(samples.stamp_ns[-1])
             self._blocks.append(samples)
@@ -56,5 +56,5 @@ class SampleBuffer:
 
 
 def _owned(samples):
-    """Return `samples` in memory of their own: a slice would keep the whole block it was cut from."""
+    """Return a copy of `samples`: a slice would keep the complete block in memory."""
     return type(samples).concatenate([samples])

@@ -1,4 +1,4 @@
-"""Times of the samples of an IMU: its stamps where they are regular, else those of a clock drawn through them, in bounded memory."""
+"""Times of the samples of an IMU: its stamps if they are regular, otherwise a clock fitted to them, in bounded memory."""
 
 from dataclasses import replace
 from typing import Any
@@ -21,24 +21,24 @@ from imu_calibration.segmentation.stamping import (
 )
 
 RARE = 4
-"""Stamps that are counted are looked at again after so many blocks."""
+"""Counted stamps are reviewed once in this number of blocks."""
 HISTORY = 4 * LAG
-"""Stamps from which counted and irregular ones are told apart."""
+"""Number of stamps for the decision between counted and irregular."""
 
 
 class SampleTimes:
     """
-    Puts regular times on samples whose stamps follow a clock only loosely; the outcome does not depend on how the stream is cut.
+    Assigns regular times to samples with irregular stamps; the result does not depend on the division of the stream into blocks.
 
-    Regular stamps pass as they are and at once, but for the first few; every 64 samples they are looked at again. Repeated messages (same
-    stamp, same readings) are taken out.
+    Regular stamps pass unchanged and without delay, except for the first few; they are reviewed every 64 samples. Repeated messages (same
+    stamp, same readings) are removed.
     """
 
     def __init__(self) -> None:
         self.line: StampLine | None = None
-        """How the stamps are, as far as that is known."""
+        """Relation of the stamps to the sampling, as far as known."""
         self.n_rebuilt = self.n_irregular = self.n_repeated = 0
-        """Samples with a time of their own; samples whose stamps follow no clock; repeated messages."""
+        """Samples with a computed time; samples whose stamps follow no clock; repeated messages."""
         self._odd_lines: dict[Stamping, StampLine] = {}
         self._last: Any = None
         self._begin()
@@ -50,7 +50,7 @@ class SampleTimes:
         self._history, self._unseen, self._reviewed = np.zeros(0, np.int64), 0, 0
 
     def push(self, samples: ImuSamples) -> ImuSamples | None:
-        """Return the samples whose times are known now, in the order of arrival; None for none."""
+        """Return the samples whose times are determined now, in the order of arrival; None for none."""
         if self._pass(samples):
             return samples
         samples, ready = self._without_repeated(samples), []
@@ -62,7 +62,7 @@ class SampleTimes:
         return _joined(ready)
 
     def finish(self) -> ImuSamples | None:
-        """Return what was held; after this the stream begins anew."""
+        """Return the buffered samples, and reset."""
         if self._learning and self._held is not None:
             self._judge(describe_stamps(self._held.stamp_ns))
         ready = self._counted(final=True) if self._clock is not None else [self._held]
@@ -70,10 +70,10 @@ class SampleTimes:
         return _joined(ready)
 
     def _pass(self, samples: ImuSamples) -> bool:
-        """Return whether all steps are those of the clock that is known, as usual: then nothing else has to be looked at."""
+        """Return whether all steps agree with the known clock: the usual case, without further tests."""
         if self._learning or self._clock is not None or self.line is None or not len(samples):
             return False
-        step = np.diff(np.concatenate([self._history[-self._unseen - 1:], samples.stamp_ns]))   # the whole block that is looked at next
+        step = np.diff(np.concatenate([self._history[-self._unseen - 1:], samples.stamp_ns]))   # the complete block of the next review
         if not np.all((step > EARLY * self.line.period_ns) & (step <= LATE * self.line.period_ns)):
             return False
         self._unseen = (self._unseen + len(samples)) % BLOCK
@@ -94,7 +94,7 @@ class SampleTimes:
         return joined.select(new)
 
     def _take(self, part: ImuSamples) -> list:
-        """Take a block or the rest of one; return what is ready."""
+        """Add a block or a part of one; return the samples that are ready."""
         if self._learning:
             self._held = part if self._held is None else ImuSamples.concatenate([self._held, part])
             stamp_ns = self._held.stamp_ns
@@ -111,7 +111,7 @@ class SampleTimes:
         return ready
 
     def _on(self, part: ImuSamples | None) -> list:
-        """Hand on what is held and a further part, as they are or through the clock."""
+        """Return the held samples and a further part, unchanged or with times from the clock."""
         if self._clock is None:
             held, self._held = self._held, None
             self.n_irregular += len(part or ()) if self.line is not None and self.line.word == IRREGULAR else 0
@@ -122,7 +122,7 @@ class SampleTimes:
         return self._counted()
 
     def _counted(self, final: bool = False) -> list:
-        """Return the samples at the front whose times the clock has told."""
+        """Return the samples at the front whose times are determined."""
         times = self._clock.take(final)
         if not len(times):
             return []
@@ -131,12 +131,12 @@ class SampleTimes:
         return [replace(timed, stamp_ns=times)]
 
     def odd_line(self, count: int) -> StampLine | None:
-        """Return how the stamps were where they were not regular, when that concerns more than a few of `count` samples."""
+        """Return the relation of the irregular stamps to the sampling, when it concerns more than a few of `count` samples."""
         number, word = max((self.n_rebuilt, COUNTED), (self.n_irregular, IRREGULAR))
         return self._odd_lines.get(word) if number > IRREGULAR_SHARE * count else None
 
     def _odd(self) -> bool:
-        """Return whether the steps of the last block are not those of the clock that is known."""
+        """Return whether the steps of the last block differ from the known clock."""
         if self.line is None:
             return True
         step = np.diff(self._history[-BLOCK - 1:])
@@ -144,7 +144,7 @@ class SampleTimes:
         return bool(np.count_nonzero(~regular) > IRREGULAR_SHARE * len(step))
 
     def _judge(self, line: StampLine | None) -> list:
-        """Count from now on, or no longer, as the stamps are; return what becomes ready by that."""
+        """Start or stop counting according to the stamps; return the samples that become ready."""
         if line is None:
             return []
         before, self.line = self.line, line

@@ -1,4 +1,4 @@
-"""Single readings that no motion explains: a glitch on the bus, a corrupt message; dropped before anything is averaged."""
+"""Single outlying readings: a glitch on the bus, a corrupt message; dropped before any averaging."""
 
 
 import numpy as np
@@ -6,40 +6,40 @@ import numpy as np
 from imu_calibration.samples import ImuSamples
 
 CHUNK = 32
-"""Samples over which the noise is taken."""
+"""Samples per estimate of the noise."""
 BREAK_NS = 10**9
 """Samples further apart than this are not neighbours."""
 REACH = 8
-"""Samples on either side that are looked at; as many are held back."""
+"""Samples on either side that the test uses; the same number is buffered."""
 NEAR = 4
-"""Samples on either side that a reading is compared with."""
+"""Samples on either side for the comparison of a reading."""
 LARGE = 8.0
-"""Departures below so many noise sds are left alone."""
+"""Deviations below this many noise sds are not tested."""
 SHARE = 0.2
-"""Largest difference of the predictions from either side, as a share of the departure: a knock, a stop and fast twisting exceed it."""
+"""Largest difference of the predictions from either side, as a share of the deviation: a knock, a stop and fast twisting exceed it."""
 SPREAD = 10.0
-"""Times the spread of the eight neighbours without the two lowest and the two highest."""
+"""Factor on the spread of the eight neighbours without the two lowest and the two highest."""
 MARGIN = 0.25
 """The same in units of `LARGE` noise sds, for the noise of these predictions."""
 SHARED = 1.5
-"""The same for the differences among the four neighbours, whose own noise is 0.4 of this unit: more in two of six readings is a knock."""
+"""The same for the differences of the four neighbours, of which the noise is 0.4 of this unit: more in two of six readings is a knock."""
 BETWEEN = (0.03, 0.4)
-"""A neighbour that departs by more than the first share of a spike, and less than the second, belongs to a knock."""
+"""A neighbour that deviates by more than the first share of a spike, and less than the second, indicates a knock."""
 TINY = 1e-7
-"""Share of the readings below which differences are rounding."""
+"""Share of the readings below which differences are due to rounding."""
 _CANDIDATE = 6.0
 _NORMAL = 1.4826 / np.sqrt(1.5)   # sd of white noise over the median of |x_k - (x_k-1 + x_k+1) / 2|
 
 
 class SpikeFilter:
     """
-    Passes samples on without spikes; the outcome does not depend on how the stream is cut into pieces.
+    Removes spikes from a stream; the result does not depend on the division of the stream into pieces.
 
-    A reading is a spike when it departs by more than `LARGE` sds of the noise, and by much more than its neighbours depart from each other,
-    from the cubic through the four nearest, which follows fast motion and which the readings on either side alone must meet. Where one of
-    these is wrong as well, the median of the nine around it replaces the cubic (Hampel's test). The noise is that of the chunk of samples
-    before or of the samples around, from medians of second differences; white noise passes 8 sds once in 1e15 samples. Source: Pearson et
-    al., EURASIP J. Adv. Signal Process. 2016:87.
+    A reading is a spike when its deviation from the cubic through the four nearest readings exceeds `LARGE` sds of the noise and by far the
+    differences of its neighbours. The cubic follows fast motion; it must agree with the predictions from each side. Where one of the four
+    is an outlier as well, the median of the nine readings around replaces the cubic (Hampel's test). The noise is estimated from medians of
+    second differences, over the chunk of samples before or the samples around; white noise exceeds 8 sds once in 1e15 samples. Source:
+    Pearson et al., EURASIP J. Adv. Signal Process. 2016:87.
     """
 
     def __init__(self) -> None:
@@ -51,7 +51,7 @@ class SpikeFilter:
         self._noise, self._n_noise, self._step = np.zeros((1, 6)), 0, np.full(6, np.inf)
 
     def push(self, samples: ImuSamples) -> list[ImuSamples]:
-        """Return the ImuSamples that are decided upon by now, in a list; the last `REACH` are held back."""
+        """Return a list of the ImuSamples with a decision; the last `REACH` are buffered."""
         passed = []
         for part in _without_breaks(samples):
             if self._held is not None and part.stamp_ns[0] - self._held.stamp_ns[-1] > BREAK_NS:
@@ -62,20 +62,20 @@ class SpikeFilter:
         return passed
 
     def finish(self) -> list[ImuSamples]:
-        """Return what was held back, and begin anew."""
+        """Return the buffered samples, and reset."""
         rest = [] if self._held is None else self._decide(len(self._held))
         self._begin()
         return rest
 
     def _decide(self, count):
-        """Return the first `count` of the samples held, without spikes, in a list."""
+        """Return the first `count` of the buffered samples, without spikes, in a list."""
         if not count:
             return []
         samples, held = self._held.select(slice(0, count)), self._held.select(slice(count, None))
         at = len(self._values) - len(self._held) + np.arange(count)
         spiky = self._spikes(at)
         self.dropped, self._held = self.dropped + int(np.count_nonzero(spiky)), held
-        kept = max((at[-1] + 1 - REACH) // CHUNK - 1, 0) * CHUNK   # the first row of what is kept has no second difference
+        kept = max((at[-1] + 1 - REACH) // CHUNK - 1, 0) * CHUNK   # the first of the kept rows has no second difference
         self._values, self._first = self._values[kept:], self._first + kept
         self._noise = self._noise[-2 - (len(self._values) + REACH) // CHUNK:]
         return [samples.select(~spiky) if spiky.any() else samples]
@@ -97,7 +97,7 @@ class SpikeFilter:
             window, column = first[:, None] + np.arange(2 * REACH + 1), column[:, None]
             inner = np.clip(at[row], 2, len(values) - 3)
             knock = _knocked(values[inner[:, None] + [-2, -1, 1, 2]], limit[row]) & (inner == at[row])
-            # where everything shakes, as at the first touch of a hand, the noise before says nothing; a spike shows in three second
+            # during vibration, as at the first touch of a hand, the previous noise does not apply; a spike affects three second
             # differences, two in six
             shaking = LARGE * _NORMAL * np.median(second[window[:, 1:-1], column], axis=1)
             limit = np.maximum(limit[row, column[:, 0]], shaking)
@@ -107,7 +107,7 @@ class SpikeFilter:
         return spiky
 
     def _add_noise(self, second):
-        """Take the noise sd of each chunk that is whole by now, never below the converter's step, shape (n_chunks, 6)."""
+        """Estimate the noise sd of each complete chunk, at least the converter's step, shape (n_chunks, 6)."""
         start = self._n_noise * CHUNK - self._first
         count = (len(second) - 1 - start) // CHUNK if len(second) > CHUNK else 0
         if self._n_noise == 0 and count == 0:   # a stream that ended before
@@ -120,7 +120,7 @@ class SpikeFilter:
         steps = np.where(change > 0, change, np.inf).min(axis=1)
         steps = np.minimum.accumulate(np.vstack([self._step, steps]))[1:]
         usual = _NORMAL * np.median(parts, axis=1)
-        # an output that stands still (clipped, frozen, coarse) says nothing of its noise: that of the chunk before goes on
+        # a constant output (clipped, frozen, coarse) has no noise estimate: the previous one is kept
         told = np.vstack([self._noise[-1:], usual])
         last = np.maximum.accumulate(np.where(told > 0, np.arange(len(told))[:, None], 0))
         usual = np.take_along_axis(told, last, axis=0)[1:]
@@ -137,16 +137,16 @@ def _without_breaks(samples):
 
 
 def _knocked(beside, limit):
-    """Return where two or more of the six readings depart in the neighbours `beside` (m, 4, 6) as well: motion reaches several axes."""
+    """Return where two or more of the six readings deviate in the neighbours `beside` (m, 4, 6) as well: motion affects several axes."""
     return np.count_nonzero(np.abs(np.einsum('mkc,k->mc', beside, [-1.0, 2.0, -2.0, 1.0])) > SHARED * limit, axis=1) >= 2
 
 
 def _contradicted(around, place, limit):
     """
-    Compare with the cubic through two neighbours on either side, and with the straight lines through the two on each side alone.
+    Compare with the cubic through two neighbours on either side, and with the straight lines through the two on each side.
 
-    A motion that differs so much at one reading shows in its neighbours: the impulse response of 0.9 of the Nyquist bandwidth has a tenth
-    there. Both lines must therefore meet the cubic; the reading's `place` in `around` is the middle but at the ends.
+    A motion with such a deviation at one reading also affects its neighbours: the impulse response of 0.9 of the Nyquist bandwidth has a
+    tenth there. Both lines must therefore agree with the cubic; `place` of the reading in `around` is the middle except at the ends.
     """
     a, b, x, c, d = around[:, NEAR - 2:NEAR + 3].T
     predicted = (4 * (b + c) - (a + d)) / 6
@@ -155,7 +155,7 @@ def _contradicted(around, place, limit):
 
 
 def _off_the_median(around, place, limit):
-    """Compare with the median, which stands two wrong readings beside the one in question."""
+    """Compare with the median, which is robust to two further outliers."""
     ordered, rows = np.sort(around, axis=1), np.arange(len(around))
     off = np.abs(around - ordered[:, [NEAR]])
     own = off[rows, place]

@@ -1,9 +1,9 @@
 """
-How the stamps of one stream relate to its sampling.
+Relation of the stamps of one stream to its sampling.
 
-An IMU samples by a clock of its own; its stamps are often made when messages arrive: eight at once from a USB packet, late by whatever the
-bus took, in whole milliseconds, or not at all. Where the stamps stay near a line through the number of the sample, counting says when each
-was taken (`COUNTED`); where they run away from every such line the sampling itself is irregular, and the stamps are all there is.
+An IMU samples by its own clock; its stamps are often times of arrival: eight at once from a USB packet, delayed by the bus, or
+rounded to milliseconds. Where the stamps are near a line through the sample number, the line gives the sampling times
+(`COUNTED`); where they diverge from every line the sampling itself is irregular, and the stamps are used unchanged.
 """
 
 from dataclasses import dataclass
@@ -13,57 +13,57 @@ import numpy as np
 
 
 class Stamping(StrEnum):
-    """What a stretch of stamps can be used for."""
+    """Use of a stretch of stamps."""
 
     REGULAR = 'regular'
-    """Steps are those of a clock, or whole multiples where samples were lost: the stamps are right as they are."""
+    """Steps of a clock, or integer multiples where samples were lost: the stamps are used unchanged."""
     COUNTED = 'counted'
-    """Steps scatter, but about a line through the number of the sample: times are drawn along that line."""
+    """Steps scatter about a line through the number of the sample: times are computed from that line."""
     IRREGULAR = 'irregular'
-    """Steps scatter and follow no line: nobody can tell when the samples were taken better than the stamps do."""
+    """Steps scatter and follow no line: the stamps are the best estimate of the sampling times."""
 
 
 REGULAR, COUNTED, IRREGULAR = Stamping
 EARLY, LATE = 0.5, 1.5
 """A step between these many periods is a regular one."""
 WHOLE = 0.1
-"""A longer step that is within this share of a period of a whole number of periods is regular too: samples were lost."""
+"""A longer step within this share of a period of an integer number of periods is regular too: samples were lost."""
 IRREGULAR_SHARE = 0.05
-"""Up to this share of the steps may be anything."""
+"""Largest share of irregular steps."""
 MOST_LOST = 4
-"""So many samples may be lost for each one that came, before the period is not what the usual step says."""
+"""Largest number of lost samples per received one; beyond it the usual step is not the period."""
 LAG = 64
-"""Samples across which the scatter of the stamps is compared with that across one."""
+"""Lag, in samples, at which the variance of stamp differences is compared with the variance at lag one."""
 DRIFTING = 16.0
 """
-Ratio of those variances from which the steps are independent of one another, so that the stamps run away from every line.
+Ratio of these variances from which the steps are independent of one another, so that the stamps diverge from every line.
 
 It is about 1 for jitter about a line, `LAG` for independent steps, and below 11 for packets of up to 100 samples.
 """
 PAUSE_NS = 1_000_000_000
-"""A longer step is a pause; nothing is counted across it."""
+"""A longer step is a pause; counting restarts after it."""
 SKEWED = 0.35
 """Largest share of the range of times of arrival below their median: 0.5 of symmetric jitter, 0.17 of exponential lateness."""
 PACKET = 1.5
-"""Samples that come together, on average, from which stamps are those of packets."""
+"""Samples received together, on average, from which stamps are those of packets."""
 LEAST = 16
-"""Steps from which a period can be told."""
+"""Fewest steps for an estimate of the period."""
 
 
 @dataclass(frozen=True)
 class StampLine:
-    """How stamps lie about a line through the number of the sample."""
+    """Distribution of stamps about a line through the number of the sample."""
 
     word: Stamping
-    """What they can be used for."""
+    """Use of the stamps."""
     period_ns: float
     """Sampling period."""
     low_ns: float = 0.0
-    """Smallest distance of a stamp from the line, which goes through the sampling times."""
+    """Smallest distance of a stamp from the line of the sampling times."""
     high_ns: float = 0.0
     """Largest distance."""
     at_once: float = 1.0
-    """Samples that come together, on average."""
+    """Samples received together, on average."""
 
     @property
     def arrivals(self) -> bool:
@@ -85,19 +85,19 @@ class StampLine:
 
 def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
     """
-    Return the StampLine of the stamps of one stretch in the order of arrival, None when they are too few to tell.
+    Return the StampLine of the stamps of one stretch in the order of arrival, None when they are too few.
 
     Parameters
     ----------
     stamp_ns : ndarray of int64, shape (n,)
-        Repeated messages taken out; 256 or more tell counted stamps from irregular ones, with fewer that question stays open.
+        Without repeated messages; at least 256 are required to separate counted from irregular stamps.
 
     """
     step = np.diff(stamp_ns)
     step = step[np.abs(step) <= PAUSE_NS]
     if len(step) < LEAST:
         return None
-    in_order = np.diff(np.sort(stamp_ns))   # neighbours that overtook each other are no fault of the stamps
+    in_order = np.diff(np.sort(stamp_ns))   # exchanged neighbours are no error of the stamps
     in_order = in_order[in_order <= PAUSE_NS]
     line = _regular(in_order, float(np.median(in_order)))
     if line is not None or len(stamp_ns) < 4 * LAG:
@@ -118,14 +118,14 @@ def _regular(step: np.ndarray, usual: float) -> StampLine | None:
     if usual <= 0 or regular_share(step, usual) < 1 - IRREGULAR_SHARE:
         return None
     number = np.rint(step / usual)
-    # late, and the next is the earlier
+    # the sample is late, and the next one earlier
     number[(step <= LATE * usual) | ((number < MOST_LOST) & (np.abs(step / usual - number) > WHOLE))] = 1.0
     used = (step > 0) & (number <= MOST_LOST)
     return StampLine(REGULAR, float(step[used].sum() / number[used].sum()))
 
 
 def regular_share(step: np.ndarray, period: float) -> float:
-    """Return the share of steps that one clock with lost samples makes; 0 when more would be lost than `MOST_LOST` allows."""
+    """Return the share of steps consistent with one clock and lost samples; 0 when more than `MOST_LOST` would be lost."""
     number = np.rint(step / period)
     whole = np.abs(step / period - number)
     good = ((step > EARLY * period) & (step <= LATE * period)) | ((number >= 2) & (whole <= WHOLE))
@@ -134,16 +134,16 @@ def regular_share(step: np.ndarray, period: float) -> float:
 
 
 def _without_losses(apart: np.ndarray, resolution: float) -> np.ndarray:
-    """Return the distances across `LAG` steps but for those that hold lost samples or a pause."""
+    """Return the differences across `LAG` steps, without the ones that contain lost samples or a pause."""
     off = np.abs(apart - np.median(apart)) if len(apart) else apart
     return apart[off <= 3 * np.median(off) + 0.5 * np.median(apart) / LAG + resolution] if len(apart) else apart
 
 
 def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
     """
-    Return the line of stamps near it: through the earliest ones of times of arrival, else through their median.
+    Return the line of stamps near it: through the earliest ones of times of arrival, otherwise through their median.
 
-    Times of arrival keep the order, are late by more than a period, and come in packets or with a distribution skewed to late stamps. The
+    Times of arrival keep the order, are late by more than a period, and arrive in packets or with a distribution skewed to late stamps. The
     earliest of symmetric jitter is no sampling time: with 3 ms (Gaussian) it is 7 ms early and scatters three times as much as the mean.
     """
     number = np.arange(len(stamp_ns))

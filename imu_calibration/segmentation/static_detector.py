@@ -1,4 +1,4 @@
-"""Rest found from the IMU alone, for recordings without a table."""
+"""Rest detected from IMU data only, for recordings without a table."""
 
 import numpy as np
 
@@ -8,17 +8,17 @@ from imu_calibration.segmentation.quiet_detector import BELOW, SPANS, QuietFloor
 from imu_calibration.segmentation.window_settings import WindowSettings
 
 _TURNING_SD = 30.0
-"""A mean rate that many noise sds, and a hundredth of the largest rate, off the usual one is a steady turn, not a bias."""
+"""A mean rate that differs from the usual one by this many noise sds and a hundredth of the largest rate is a steady turn, not a bias."""
 
 _STEP_SPAN = 0.5
-"""Means over so many seconds are compared with the next to find where rest goes over into a slow turn."""
+"""Duration of the means whose differences show a transition from rest to a slow turn, s."""
 _ENOUGH = 6
-"""Intervals whose mean rates show how they scatter."""
+"""Fewest intervals for the scatter of their mean rates."""
 _SCATTERS = 8.0
-"""A mean rate that stands out from both neighbours by so many times the scatter (and the noise of one sample at least) is a turn."""
+"""A mean rate that differs from both neighbours by this many times the scatter (at least the noise of one sample) is a turn."""
 
 _LEAVES = 5.0
-"""A low-passed reading that differs from the mean of the middle half by more than so many sds belongs to the turn before or after."""
+"""A low-passed reading that differs from the mean of the middle half by more than this many sds belongs to the turn before or after."""
 
 _LARGEST_GROWTH = 4.0
 """Bias wander over a long rest adds less variance than this."""
@@ -26,10 +26,10 @@ _LARGEST_GROWTH = 4.0
 
 def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> list[slice]:
     """
-    Find the intervals in which the IMU alone shows rest.
+    Find the intervals of rest from IMU data only.
 
-    Compares short-time variances with the quietest tenth of the recording, so any unit will do, counts too. The
-    first `settling` seconds of an interval are left out, except at the start of the recording; steady turns and intervals shorter than
+    Compares short-time variances with the quietest tenth of the recording, so any unit is allowed, also counts. The
+    first `settling` seconds of an interval are excluded, except at the start of the recording; steady turns and intervals shorter than
     `static_minimum` are not reported.
 
     Parameters
@@ -78,7 +78,7 @@ def _intervals(stamp_ns, quiet, period, settings):
 
 
 def _keeps_attitude(force, period):
-    """Tell whether the scatter over the whole interval is that of short spans: where everything shakes, slow turns look quiet."""
+    """Return whether the scatter over the interval equals the scatter over short spans: under vibration, slow turns are quiet."""
     width = min(max(10, int(round(SPANS[0] / period))), len(force))
     pieces = force[:len(force) // width * width].reshape(-1, width, 3)
     local = np.mean(pieces.var(axis=1, ddof=1).sum(axis=1)) + least_variance(force)
@@ -86,7 +86,7 @@ def _keeps_attitude(force, period):
 
 
 def _at_one_rate(rate, found, period, shortest):
-    """Cut intervals where the rate steps by more than its noise: rest goes over into a slow turn that is as quiet."""
+    """Divide intervals where the rate changes by more than its noise: a transition from rest to a slow turn that is as quiet."""
     if not found:
         return found
     noise = np.median([rate[piece].std(axis=0) for piece in found], axis=0)
@@ -101,12 +101,12 @@ def _at_one_rate(rate, found, period, shortest):
 
 
 def _least_step(rate):
-    """Return the rate step, shape (3,), below which nothing counts: a thousandth of the largest rate."""
+    """Return the least rate step, shape (3,): a thousandth of the largest rate."""
     return 1e-3 * np.abs(rate - np.median(rate, axis=0)).max(axis=0)
 
 
 def _trimmed(imu, found, period, shortest):
-    """Cut both ends of intervals from where the low-passed readings leave the scatter of the middle: a turn begins below the noise."""
+    """Trim both ends of intervals where the low-passed readings exceed the scatter of the middle: a turn begins below the noise."""
     first, last = (np.array([getattr(piece, end) for piece in found], int) for end in ('start', 'stop'))
     width = 2 * int(round(BELOW / period / 2)) + 1
     for values in (imu.force_s, imu.rate_s) if found else ():
@@ -124,7 +124,7 @@ def _trimmed(imu, found, period, shortest):
 
 
 def _not_turning(rate, found):
-    """Leave out intervals whose mean rate is far from that of their neighbours: turns slow and steady enough to look like rest."""
+    """Exclude intervals whose mean rate differs significantly from their neighbours: slow and steady turns."""
     if len(found) < 2:
         return found
     means = np.array([rate[piece].mean(axis=0) for piece in found])
@@ -132,7 +132,7 @@ def _not_turning(rate, found):
     usual = np.median(means, axis=0)
     limit = np.maximum(_TURNING_SD * noise, 0.01 * np.abs(rate - usual).max(axis=0))
     keep = np.all(np.abs(means - usual) <= limit, axis=1)
-    if len(found) >= _ENOUGH:   # one that stands alone between its neighbours; biases that warm up follow a course
+    if len(found) >= _ENOUGH:   # an isolated deviation from both neighbours; the drift of warming biases is smooth
         step = np.diff(means, axis=0)
         alone = np.minimum(np.minimum(np.abs(step[:-1]), np.abs(step[1:])), 0.5 * np.abs(step[1:] - step[:-1]))
         scatter = np.median(np.abs(step), axis=0) / (0.6745 * np.sqrt(2))

@@ -1,4 +1,4 @@
-"""Streams brought together, chunk by chunk of a fixed grid in time: the joints at the IMU's stamps and what they do."""
+"""Alignment of streams, chunk by chunk of a fixed grid in time: position and phase of the joints at the IMU's stamps."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,20 +17,20 @@ from imu_calibration.segmentation.window import PhasedSamples
 from imu_calibration.segmentation.window_settings import WindowSettings
 
 JOINT_WAIT = 60.0
-"""The IMU or the joints may be ahead of each other by this much before the missing ones are given up, s."""
+"""The IMU or the joints may be ahead of each other by this much before missing samples are skipped, s."""
 TEMPERATURE_WAIT = 5.0
-"""Temperature may come later than the IMU by this much, s."""
+"""Largest delay of the temperature relative to the IMU, s."""
 _LEAST_MARGIN = max(joint_phases.REACH, REACH) + 0.4
 NEVER = 1 << 62
 
 
 class MotionChunks:
     """
-    One epoch of the clock: takes samples as they come and hands out `PhasedSamples`, in order.
+    One epoch of the clock: converts samples to `PhasedSamples`, in order.
 
-    Chunk k holds the IMU samples of `chunk` seconds from ``start + k * chunk`` on; `start` is the first IMU sample. What
-    comes out depends on samples within the chunk and a margin only, and a chunk is worked on when all streams have passed
-    its margin (or are given up), so the cut of the streams into blocks plays no role. The waiting times bound the memory.
+    Chunk k holds the IMU samples of `chunk` seconds from ``start + k * chunk`` on; `start` is the first IMU sample. The
+    result depends on samples within the chunk and a margin only, and a chunk is processed when all streams have passed
+    its margin (or are given up), so the division of the streams into blocks has no effect. The waiting times bound the memory.
     """
 
     def __init__(self, settings: WindowSettings, noise_rad: float | None, floors: tuple[QuietFloor, QuietFloor]):
@@ -53,7 +53,7 @@ class MotionChunks:
         return min(self._settings.settling + self._settings.static_minimum, self.margin)
 
     def change(self, settings: WindowSettings) -> None:
-        """Work by other settings from the next chunk on; the length of the chunks and their margin stay."""
+        """Use other settings from the next chunk on; the length of the chunks and their margin are unchanged."""
         self._settings = settings
 
     @property
@@ -69,7 +69,7 @@ class MotionChunks:
         return self.time_origin + (self._imu.newest_ns - self._start_ns) / 1e9
 
     def add(self, imu: ImuSamples | None = None, joints: JointSamples | None = None, temperature: TemperatureSamples | None = None) -> None:
-        """Take cleaned samples, each stream in the order of its stamps."""
+        """Add cleaned samples, each stream in the order of its stamps."""
         if imu is not None and len(imu):
             if self._start_ns is None:
                 self._start_ns = int(imu.stamp_ns[0])
@@ -82,7 +82,7 @@ class MotionChunks:
             self._temperature.add(replace(temperature, branch=self._branch.of(temperature.temperature_c)))
 
     def take(self, final: bool = False) -> Iterator[PhasedSamples]:
-        """Yield the chunks that can be worked on (all with `final`) as `PhasedSamples` without those that have no joints."""
+        """Yield the chunks that can be processed (all with `final`) as `PhasedSamples`, without samples that have no joints."""
         if self._start_ns is not None:
             passed = np.inf if final else self._passed_ns()
             while self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed and self._advance(passed, final):
@@ -107,7 +107,7 @@ class MotionChunks:
         return min(imu, joints, max(temperature, imu - _ns(TEMPERATURE_WAIT)))
 
     def _advance(self, passed, final):
-        """Go to the next chunk that has IMU samples; False when there is none yet."""
+        """Advance to the next chunk with IMU samples; False when there is none yet."""
         oldest = self._imu.first_from(self._next_start_ns())
         if oldest is None:
             if not final:
@@ -117,7 +117,7 @@ class MotionChunks:
         return self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed
 
     def _not_late(self, samples, reason):
-        """Return `samples` without those that belong to chunks already worked on."""
+        """Return `samples` without the ones in chunks already processed."""
         if self._start_ns is None or self._chunk == 0:
             return samples
         late = int(np.searchsorted(samples.stamp_ns, self._next_start_ns() - (0 if reason else self._margin_ns)))
@@ -140,7 +140,7 @@ class MotionChunks:
             self.counts[reason] = self.counts.get(reason, 0) + int(number)
 
     def _work(self, start_ns, final):
-        """Return the chunk from `start_ns` on, or None when nothing in it can be used."""
+        """Return the chunk from `start_ns` on, or None when no sample in it can be used."""
         stop_ns = start_ns + self._chunk_ns
         imu = self._imu.between(start_ns - self._margin_ns, stop_ns + self._margin_ns)
         core = slice(*np.searchsorted(imu.stamp_ns, [start_ns, stop_ns]))
@@ -188,7 +188,7 @@ class MotionChunks:
         return phase, level, steps
 
     def _draw_curves(self, motion, time, phase, runs):
-        """Put the joints' motion on the samples near which joints move."""
+        """Set the joints' motion on the samples near moving joints."""
         for run in runs:
             need = np.flatnonzero((phase != LOST) & run.near_motion(time, self.short_rest))
             if not len(need):
@@ -214,7 +214,7 @@ class MotionChunks:
         return np.interp(at, known, readings.temperature_c), np.interp(at, known, readings.branch)
 
     def _at_edge(self, stamp_ns, limit, final):
-        """Tell which samples are so close before the first joint state or after the last that nothing is missing."""
+        """Return a mask of the samples close before the first joint state or after the last one, where no joint state is missing."""
         if self._first_joint_ns is None:
             return np.zeros(len(stamp_ns), bool)
         edge = (stamp_ns < self._first_joint_ns) & (stamp_ns >= self._first_joint_ns - _ns(limit))

@@ -1,4 +1,4 @@
-"""One stream of stamped samples, cleaned: what cannot be used is dropped with a count, and the stamps are described."""
+"""One stream of stamped samples, cleaned: unusable samples are dropped and counted, and the stamps are described."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,21 +12,21 @@ from imu_calibration.segmentation.stamping import StampLine
 
 _SECOND = 1_000_000_000
 BACKWARD_RESET_NS = _SECOND
-"""A larger step back is a new setting of the clock, a smaller one a sample that came late."""
+"""A larger backward step is a reset of the clock, a smaller one a late sample."""
 FORWARD_RESET_NS = 3600 * _SECOND
-"""A larger step ahead is a new setting of the clock as well (a computer that learns the date after start-up)."""
+"""A larger forward step is a reset of the clock as well (a computer that receives the date after start-up)."""
 _NEEDED = {ImuSamples: ('force_s', 'rate_s'), JointSamples: ('position',), TemperatureSamples: ('temperature_c',)}
 
 
 class StreamCheck:
     """
-    Cleans one stream; the outcome does not depend on how it is cut into pieces.
+    Cleans one stream; the result does not depend on its division into pieces.
 
-    Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps stays), 'backward stamp' (a sample that came
-    late), 'stray stamp' (one sample far from both neighbours), of an IMU also 'spike' (`spike_filter`). 'clock reset' counts the jumps,
+    Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps is kept), 'backward stamp' (a late
+    sample), 'stray stamp' (one sample far from both neighbours), of an IMU also 'spike' (`spike_filter`). 'clock reset' counts the jumps,
     each of which starts a new epoch.
-    Where the stamps of an IMU follow a clock only loosely (packets, times of arrival, whole milliseconds, jitter) its samples get times
-    of their own first (see `sample_times`).
+    Where the stamps of an IMU follow a clock only loosely (packets, times of arrival, milliseconds, jitter), the times of its samples
+    are computed first (see `sample_times`).
     """
 
     def __init__(self) -> None:
@@ -44,23 +44,23 @@ class StreamCheck:
 
     @property
     def line(self) -> StampLine | None:
-        """How the stamps of an IMU are (`stamping.StampLine`); None for other streams, and while too few came to tell."""
+        """Regularity of the IMU stamps (`stamping.StampLine`); None for other streams, and until enough stamps have been received."""
         return None if self._times is None else self._times.line
 
     def push(self, samples: Any) -> list[tuple[int, Any]]:
-        """Return a list of (epoch, samples) that are accepted; a few are held while their times are open."""
+        """Return a list of (epoch, samples) that are accepted; a few are buffered until their times are determined."""
         if samples is None or not len(samples):
             return []
         return self._without_spikes(self._accept(self._without_strays(self._finite(samples))))
 
     def finish(self) -> list[tuple[int, Any]]:
-        """Return what was held, as `push` does."""
+        """Return the buffered samples, as `push` does."""
         held, self._held = self._held, None
         return self._without_spikes(([] if held is None else self._accept(held)) + self._end_epoch(), ended=True)
 
     def statistics(self, gap: float = 0.1) -> 'StreamStatistics':
         """
-        Return the `StreamStatistics` of what was accepted until now.
+        Return the `StreamStatistics` of the accepted samples.
 
         Parameters
         ----------
@@ -159,7 +159,7 @@ class StreamCheck:
         return [] if self._times is None else self._in_order(self._times.finish())
 
     def _in_order(self, samples):
-        """Return [(epoch, samples)] without those that repeat a stamp or step back, [] for none."""
+        """Return [(epoch, samples)] without repeated and backward stamps, [] for none."""
         if samples is None or not len(samples):
             return []
         stamps = samples.stamp_ns
@@ -184,7 +184,7 @@ def _is_reset(step):
 
 @dataclass(frozen=True, eq=False)
 class StreamStatistics:
-    """What can be said about the stamps of one stream."""
+    """Statistics of the stamps of one stream."""
 
     count: int
     """Samples accepted."""
@@ -195,7 +195,7 @@ class StreamStatistics:
     period: float
     """Median step between stamps, s; 0 with fewer than two samples."""
     stamp_step_ns: int
-    """Greatest common divisor of the steps between stamps, ns (1000000: whole milliseconds); 0 when unknown."""
+    """Greatest common divisor of the steps between stamps, ns (1000000: milliseconds); 0 when unknown."""
     n_gaps: int
     """Number of gaps."""
     gap_total: float
@@ -203,9 +203,9 @@ class StreamStatistics:
     longest_step: float
     """Longest step between stamps, a gap or not, s."""
     stamping: StampLine | None = None
-    """How the stamps of an IMU came; None where they are regular, and for other streams."""
+    """Regularity of the stamps of an IMU; None if they are regular, and for other streams."""
     unstamped: int = 0
-    """Samples whose stamp was zero, so that the time of arrival was taken."""
+    """Samples with stamp zero, for which the time of arrival was used."""
 
     @property
     def rate(self) -> float:

@@ -1,4 +1,4 @@
-"""How long a moving window may be, so that the bias of a quiet accelerometer does not wander within it by more than noise hides."""
+"""Largest length of a moving window for which the bias change of a quiet accelerometer is below the noise."""
 
 from collections import deque
 from math import ceil
@@ -11,27 +11,27 @@ from imu_calibration.segmentation.window import PhasedSamples
 BEST_BIAS, BEST_TIME = 1e-4, 100.0
 """m/s^2 and s: the best accelerometers hold their bias to 10 ug over minutes (a Gauss-Markov process; field figures in `sensor_noise`)."""
 PIECE = 0.25
-"""Means over this time tell the noise at low frequency, s: longer than sensor filters."""
+"""Duration of the means from which noise at low frequency is estimated, s: longer than sensor filters."""
 LEAST_PIECES = 4
 SHORTEST = 5.0
-"""Moving windows are not cut shorter, s."""
+"""Least length of moving windows, s."""
 
 
 class WanderLimit:
     """
     The longest moving window that the noise at rest allows.
 
-    Over T the mean of white noise of density d scatters by ``d / sqrt(T)``, a bias by about ``sd sqrt(2 T / time)``. They meet at
-    ``T = d sqrt(time / 2) / sd``; a longer window holds a drift that least squares takes for scale factors and arms. That
-    is 80 s at 120 ug/sqrt(Hz), and less than a second at 1 ug/sqrt(Hz). Where gravity turns by more than the noise while stamps
-    are late by their jitter, the reference is what limits, and means over short windows would show its errors instead.
+    Over T the sd of the mean of white noise of density d is ``d / sqrt(T)``, of a bias about ``sd sqrt(2 T / time)``. They are equal at
+    ``T = d sqrt(time / 2) / sd``; in a longer window, drift biases scale factors and arms. That
+    is 80 s at 120 ug/sqrt(Hz), and less than a second at 1 ug/sqrt(Hz). Where the change of gravity during the jitter of the stamps
+    exceeds the noise, the reference limits the accuracy, and means over short windows would contain its errors instead.
     """
 
     def __init__(self) -> None:
         self._densities: deque[float] = deque(maxlen=9)
 
     def rested(self, samples: PhasedSamples) -> None:
-        """Learn from a window at rest."""
+        """Estimate the noise density from a window at rest."""
         period = _period(samples)
         length = int(round(PIECE / period)) if period > 0 else 0
         pieces = len(samples) // length if length else 0
@@ -40,7 +40,7 @@ class WanderLimit:
             self._densities.append(float(np.sqrt(np.median(np.diff(means, axis=0).var(axis=0) / 2) * length * period)))
 
     def pieces(self, samples: PhasedSamples) -> int:
-        """Return into how many windows motion is to be cut; one where no rest was seen yet."""
+        """Return the number of windows into which motion is cut; one if no rest has occurred yet."""
         if not self._densities or len(samples) < 3:
             return 1
         density = float(np.median(self._densities))

@@ -1,4 +1,4 @@
-"""What a window is, and how samples become one."""
+"""Windows, and their construction from samples."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,20 +11,20 @@ from imu_calibration.samples import _Columns
 
 
 class WindowKind(StrEnum):
-    """What the IMU does in a window."""
+    """Motion of the IMU in a window."""
 
     UNUSED = 'unused'
-    """Kept out on purpose."""
+    """Excluded on purpose."""
     STATIC = 'static'
     """It rests."""
     SPIN = 'spin'
     """All joint rates are constant, and one joint turns."""
     DYNAMIC = 'dynamic'
-    """Anything else that moves."""
+    """Any other motion."""
 
 
 class UnusedReason(StrEnum):
-    """Why samples that arrived whole are in no window of a kind."""
+    """Reason for which complete samples are in no window of a kind."""
 
     NONE = ''
     SETTLING = 'settling'
@@ -39,23 +39,23 @@ class Window:
     """A stretch of samples of one kind, without gaps."""
 
     kind: WindowKind
-    """What the IMU does."""
+    """Kind of motion."""
     stamp_ns: np.ndarray
     """Header stamps, int64, shape (n,)."""
     time: np.ndarray
-    """Seconds since the session's first IMU sample, shape (n,); goes on where a clock was set back."""
+    """Seconds since the session's first IMU sample, shape (n,); continues across clock resets."""
     force_s: np.ndarray
     """Measured specific force, m/s^2, shape (n, 3)."""
     rate_s: np.ndarray
     """Measured angular rate, rad/s, shape (n, 3)."""
     motion: JointMotion
-    """The joints at the IMU's stamps; one row at rest: mean position, and rates of zero unless the joints clearly creep."""
+    """The joints at the IMU's stamps; one row at rest: mean position, and rates of zero unless the joints creep significantly."""
     temperature_c: np.ndarray | None = None
     """Temperature at the samples, degrees Celsius, shape (n,), or None."""
     reason: UnusedReason = UnusedReason.NONE
     """Why the window is unused."""
     joint_step: np.ndarray | None = None
-    """Steps of the encoders that show in the readings, rad, zero where none do, shape (n_joints,)."""
+    """Steps of the encoders visible in the readings, rad, zero where none are, shape (n_joints,)."""
     corrected: np.ndarray | None = None
     """See `ImuSamples`."""
 
@@ -69,14 +69,14 @@ class Window:
 
     @property
     def noise_sd(self) -> np.ndarray:
-        """White noise of specific force and angular rate from second differences, shape (2, 3); smooth motion drops out."""
+        """White noise of specific force and angular rate from second differences, shape (2, 3); smooth motion cancels."""
         second = np.diff(np.stack([self.force_s, self.rate_s]), 2, axis=1)
         return second.std(axis=1) / np.sqrt(6) if second.shape[1] > 1 else np.full((2, 3), np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class PhasedSamples(_Columns):
-    """IMU samples with what the joints do at that time."""
+    """IMU samples with the motion of the joints."""
 
     stamp_ns: np.ndarray
     """Header stamps, shape (n,)."""
@@ -97,19 +97,19 @@ class PhasedSamples(_Columns):
     temperature_c: np.ndarray
     """NaN where unknown, shape (n,)."""
     thermal_branch: np.ndarray
-    """Which way the temperature came, NaN where it is unknown, shape (n,)."""
+    """Thermal branch (direction of the temperature change), NaN where it is unknown, shape (n,)."""
     vibration: np.ndarray
-    """How much it vibrates (`reference.vibration`), (m/s^2)^2, shape (n, 3)."""
+    """Variance of the vibration (`reference.vibration`), (m/s^2)^2, shape (n, 3)."""
     phase: np.ndarray
     """STILL, STEADY or MOVING, shape (n,)."""
     quiet: np.ndarray
     """Whether the IMU is as quiet as at rest, shape (n,)."""
     after_gap: np.ndarray
-    """Whether a window cannot go on from the sample before, shape (n,)."""
+    """Whether a window cannot continue from the sample before, shape (n,)."""
     after_loss: np.ndarray
     """Whether the joints were unknown just before, shape (n,)."""
     joint_step: np.ndarray
-    """Steps of the encoders, rad, zero where none show, shape (n, n_joints)."""
+    """Steps of the encoders, rad, zero where none are visible, shape (n, n_joints)."""
     corrected: np.ndarray | None = None
     """See `ImuSamples`."""
 
@@ -156,9 +156,9 @@ def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | No
 
 
 def _mean_motion(samples):
-    """Return one row: the mean position and, when a straight line explains the readings and noise does not, its slope."""
+    """Return one row: the mean position and, when the slope of a straight line is significant, this slope."""
     mean = samples.position.mean(axis=0)
-    some = slice(None, None, max(1, len(samples) // 500))  # the levels are averages over 0.2 s, so these say as much as all
+    some = slice(None, None, max(1, len(samples) // 500))  # the levels are averages over 0.2 s, so these contain the same information
     time, position = samples.time[some] - samples.time[some].mean(), samples.position[some] - mean
     slope = time @ position / max(time @ time, 1e-12)
     rest = (position - time[:, None] * slope).std(axis=0)

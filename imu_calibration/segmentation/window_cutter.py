@@ -1,4 +1,4 @@
-"""From samples with phases to windows: short runs are joined, settling and knocks kept out, long windows cut."""
+"""Windows from samples with phases: short runs are joined, settling and knocks excluded, long windows cut."""
 
 
 import numpy as np
@@ -16,9 +16,9 @@ _LEAST_SAMPLES = 5
 
 class WindowCutter:
     """
-    Turns samples, in order and in any pieces, into windows; holds back a few window lengths at most.
+    Converts samples, in order and in pieces of any length, to windows; buffers a few window lengths at most.
 
-    Decides in three steps, each of which waits only for what it needs:
+    Three steps, each with the least delay:
     runs of one phase that are too short for it become motion, samples get a kind, runs of one kind become windows.
     """
 
@@ -32,7 +32,7 @@ class WindowCutter:
         self._wander = WanderLimit()
 
     def change(self, settings: WindowSettings, short_rest: float) -> None:
-        """Decide by other settings from now on."""
+        """Use other settings from now on."""
         self._settings, self._short_rest = settings, short_rest
 
     @property
@@ -41,7 +41,7 @@ class WindowCutter:
         return (0 if self._waiting is None else len(self._waiting)) + (0 if self._open is None else len(self._open[0]))
 
     def push(self, samples: PhasedSamples | None, final: bool = False) -> list[Window]:
-        """Take the next samples (or None) and return the windows that are complete; with `final` all that is left."""
+        """Add the next samples (or None) and return the complete windows; with `final` all remaining ones."""
         windows = []
         if self._waiting is not None:
             samples = self._waiting if samples is None else PhasedSamples.concatenate([self._waiting, samples])
@@ -54,7 +54,7 @@ class WindowCutter:
         return windows
 
     def _decided(self, samples, final):
-        """Return the samples whose phase is final, and that phase; keep the rest waiting."""
+        """Return the samples whose phase is final, and that phase; buffer the remaining samples."""
         starts, stops = _runs(samples.phase, samples.after_gap)
         time, settings = samples.time, self._settings
         phase = samples.phase.copy()
@@ -101,7 +101,7 @@ class WindowCutter:
         return windows
 
     def _shed(self, samples, start, stop, kind, reason):
-        """Cut whole windows off a run while it is twice as long as a window, open or not: so arrival plays no role."""
+        """Cut complete windows off a run while it is twice as long as a window, open or not: independent of the time of arrival."""
         windows, longest = [], self._longest(kind)
         while samples.time[stop - 1] - samples.time[start] >= 2 * longest:
             cut = int(np.searchsorted(samples.time, samples.time[start] + longest))
@@ -133,7 +133,7 @@ class WindowCutter:
         return last
 
     def _close(self, samples, kind, reason):
-        """Return the windows of a whole run of one kind, cut into equal pieces of at most the longest length."""
+        """Return the windows of a complete run of one kind, cut into equal pieces of at most the longest length."""
         length = samples.time[-1] - samples.time[0]
         pieces = max(1, int(np.ceil(length / self._longest(kind[0]))))
         bounds = np.linspace(0, len(samples), pieces + 1).astype(int)
@@ -147,7 +147,7 @@ class WindowCutter:
         return {UNUSED: 0.0, STATIC: settings.static_minimum, SPIN: settings.spin_minimum, DYNAMIC: settings.dynamic_minimum}[kind]
 
     def _longest(self, kind):
-        # halves of a window that is a little too long must still be long enough
+        # halves of a window slightly above the longest length must not be below the shortest
         return max(self._settings.window_maximum, 2 * self._least(kind))
 
     def _finished(self, samples, kind, reason):
@@ -180,7 +180,7 @@ def _between_motion(k, before, original, after_gap, stop):
 
 
 ACCEPTED = (*_KINDS[1:], *_REASONS[1:], 'edge of joints')
-"""Counts of samples that arrived whole; the last six are excluded from windows on purpose."""
+"""Counts of complete samples; the last six are excluded from windows on purpose."""
 
 
 def dropped(counts: dict[str | UnusedReason | WindowKind, int]) -> dict[str, int]:

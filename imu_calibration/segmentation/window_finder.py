@@ -1,4 +1,4 @@
-"""Windows from streams: what comes in blocks goes out as static, spinning and dynamic windows with the joints' motion."""
+"""Windows from streams: blocks are converted to static, spinning and dynamic windows with the joints' motion."""
 
 from collections.abc import Iterable, Sequence
 
@@ -17,16 +17,16 @@ from imu_calibration.segmentation.window_settings import WindowSettings
 
 class MotionGatherer:
     """
-    Turns streams into windows, in bounded memory; the outcome does not depend on how the streams are cut into blocks.
+    Converts streams to windows, in bounded memory; the result does not depend on the division of the streams into blocks.
 
-    Cleaning is done by the `BlockCleaner`; `stream_alignment.MotionChunks` brings the joints to the IMU's stamps; `WindowCutter` makes the
-    windows. A clock that is set back starts again with the first two.
-    Streams may be late against each other by a minute (temperature: five seconds); what comes later is not used.
+    Cleaning is done by the `BlockCleaner`; `stream_alignment.MotionChunks` interpolates the joints at the IMU's stamps; `WindowCutter`
+    makes the windows. After a clock reset the first two restart.
+    Streams may differ in delay by a minute (temperature: five seconds); later samples are not used.
 
     Parameters
     ----------
     table : Table or None
-        Gives the names of the joints and their noise; None takes the joints as they come.
+        Names of the joints and their noise; None accepts the joints of the stream in their order.
     settings : WindowSettings
     keep_unused : bool
         Also return windows of kind 'unused', so that every accepted sample is in exactly one window, in order.
@@ -50,7 +50,7 @@ class MotionGatherer:
 
     @property
     def n_buffered(self) -> int:
-        """Samples held at the moment; stays bounded however long the session."""
+        """Number of buffered samples; bounded for a session of any length."""
         waiting = sum(len(part) for name in STREAMS for _, part in self._queue[name])
         return self.cleaner.n_buffered + waiting + self._chunks.n_buffered + self._cutter.n_waiting
 
@@ -62,7 +62,7 @@ class MotionGatherer:
         'static', 'spin', 'dynamic': in windows. 'settling', 'not quiet', 'turn-on', 'too short', 'rest too short': accepted, but in
         no window.
         'edge of joints': just before the first or after the last joint state, in motion. 'no joint state', 'late IMU sample',
-        'imu not finite', 'joints repeated stamp', ...: dropped; 'imu clock reset': jumps. What blocks report as dropped is not in here.
+        'imu not finite', 'joints repeated stamp', ...: dropped; 'imu clock reset': jumps. Drops reported by blocks are not included.
         """
         counts = self.cleaner.counts
         for source in (self._lost_counts, self._chunks.counts, self._cutter.counts):
@@ -71,12 +71,12 @@ class MotionGatherer:
 
     def push(self, block: SampleBlock) -> list[Window]:
         """
-        Take a block and return the windows that are complete now.
+        Add a block and return the windows that are complete now.
 
         Raises
         ------
         InputError
-            When the joints of the block are not those of the table.
+            When the joints of the block differ from the table's.
 
         """
         cleaned = self.cleaner.push(block)
@@ -84,7 +84,7 @@ class MotionGatherer:
         return self._work() if cleaned else []
 
     def finish(self) -> list[Window]:
-        """Return the remaining windows; after this nothing more may be pushed."""
+        """Return the remaining windows; no block may be added after this."""
         self._enqueue(self.cleaner.finish())
         windows = self._work()
         while any(epoch > self._epoch for name in STREAMS for epoch, _ in self._queue[name]):
@@ -93,12 +93,12 @@ class MotionGatherer:
 
     def change(self, settings: WindowSettings) -> None:
         """
-        Find windows by other settings from now on.
+        Use other settings from now on.
 
         Raises
         ------
         InputError
-            When the pieces in which the joints are smoothed, or the time kept out at the start, would change.
+            When the pieces of joint smoothing, or the excluded time at the start, would change.
 
         """
         for name in ('chunk', 'overlap', 'turn_on'):
@@ -109,7 +109,7 @@ class MotionGatherer:
         self._cutter.change(settings, self._chunks.short_rest)
 
     def all_of(self, blocks: Iterable[SampleBlock]) -> list[Window]:
-        """Return the windows of a whole recording."""
+        """Return the windows of a recording."""
         return [window for block in blocks for window in self.push(block)] + self.finish()
 
     def _enqueue(self, cleaned):
@@ -119,12 +119,12 @@ class MotionGatherer:
                 self._queue[name].append((epoch + self._epoch_shift[name], self._turns.unwrap(samples) if name == 'joints' else samples))
 
     def _work(self):
-        """Hand on what belongs to this epoch; go to the next one when the streams have."""
+        """Process the samples of this epoch; advance to the next epoch when the streams have."""
         windows = []
         while True:
             for name in STREAMS:
                 for epoch, part in self._queue[name]:
-                    if epoch == self._epoch:  # what is left of an earlier one came after its end: a temperature, too late
+                    if epoch == self._epoch:  # remaining samples of an earlier epoch arrived after its end: late temperatures
                         self._chunks.add(**{name: part})
                 self._queue[name] = [(epoch, part) for epoch, part in self._queue[name] if epoch > self._epoch]
             windows += self._cut(self._chunks.take())
@@ -134,7 +134,7 @@ class MotionGatherer:
             windows += self._next_epoch()
 
     def _epoch_is_over(self):
-        """Tell whether IMU and joints both had their clock set back, or one had and the other did not follow in time."""
+        """Return whether the clocks of IMU and joints were both reset, or only one and the other did not follow in time."""
         queues = [self._queue['imu'], self._queue['joints']]
         return all(queues) or any(queue and _span(queue) > JOINT_WAIT for queue in queues)
 
@@ -149,7 +149,7 @@ class MotionGatherer:
         return windows
 
     def _follow(self, old):
-        """Let streams whose clock was not set back go on in the new epoch: one clock moved, the others did not."""
+        """Continue streams without a clock reset in the new epoch: only one clock was reset."""
         if not self._queue['joints']:
             self._chunks.add(joints=old.joints_left())
         for name in STREAMS:
@@ -157,7 +157,7 @@ class MotionGatherer:
                 self._epoch_shift[name] = self._epoch - self.cleaner.epoch(name)
 
     def _forget_temperature(self):
-        """Bound the temperatures that wait for an epoch which the other streams do not begin."""
+        """Bound the buffer of temperatures of an epoch that the other streams do not begin."""
         queue = self._queue['temperature']
         while len(queue) > 1 and _span(queue) > JOINT_WAIT:
             del queue[0]
@@ -170,7 +170,7 @@ class MotionGatherer:
 
 
 class _Unwrapper:
-    """Undoes jumps of joint angles by whole turns, sample after sample."""
+    """Removes jumps of joint angles by full turns, sample by sample."""
 
     def __init__(self):
         self._last = None

@@ -1,4 +1,4 @@
-"""How windows are found: every adjustable number of the segmentation."""
+"""Settings of the segmentation."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from imu_calibration.settings import setting
 
 @dataclass(frozen=True)
 class WindowSettings:
-    """How static windows, constant-rate spins and dynamic stretches are found."""
+    """Settings for static windows, constant-rate spins and dynamic stretches."""
 
     static_rate: float = setting(0.002, 'rad/s', 'joints slower than this, and the IMU quiet, count as at rest', (0.0, 1.0),
                                  'too small: no static windows; too large: slow creep enters the means', live=True)
