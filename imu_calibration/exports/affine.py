@@ -1,4 +1,4 @@
-"""What other programs know of an IMU at most: offsets that follow the temperature, matrices, response to specific force, lever arms."""
+"""The largest IMU model of other programs: temperature-dependent offsets, matrices, response to specific force, lever arms."""
 
 from dataclasses import dataclass, field, replace
 
@@ -19,7 +19,7 @@ class AffineImu:
     """
     ``readings_i = bias_i + thermal_i (T - T0) + matrix_i @ (input + lever_matrix @ arm_i) + cross_i @ force``.
 
-    The input is true specific force or rate at an origin, in some frame; the readings may stand in other axes.
+    The input is true specific force or rate at an origin, in some frame; the readings may have different axes.
     """
 
     bias: dict[str, np.ndarray] = _zeros(3)
@@ -46,7 +46,7 @@ class AffineImu:
 
 
 def held_values(calibration: Calibration, effect: Effect, holding: Holding | None) -> np.ndarray:
-    """Return what is held of an effect's values: its prior where it is not held at all, shape (size,)."""
+    """Return the values of an effect as the target represents them: its prior where it is not represented, shape (size,)."""
     values = calibration.values[calibration.model.slices[effect.key]]
     return effect.prior_values() if holding is None else holding.held(values)
 
@@ -89,8 +89,8 @@ def moved(imu: AffineImu, to: Placement) -> AffineImu:
     """
     Return the same IMU in the frame, origin and axes of another program.
 
-    With ``f = mat_ts' f_t - lever_matrix @ origin_s``; what the change of origin adds to the response of the gyroscope to specific force
-    (a product of two small things) is left out.
+    With ``f = mat_ts' f_t - lever_matrix @ origin_s``; the effect of the change of origin on the gyroscope's response to specific force
+    (a product of two small terms) is omitted.
     """
     turned = {sensor: to.mat_readings @ imu.matrix[sensor] @ to.mat_ts.T for sensor in SENSORS}
     arms = np.abs(to.mat_readings) @ ((imu.arms - to.origin_s) @ to.mat_ts.T) if np.any(imu.arms) else imu.arms

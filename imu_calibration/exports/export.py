@@ -1,4 +1,4 @@
-"""The export itself: a calibration and its noise become a file for a target, with what that loses."""
+"""The export: a calibration and its noise as a file for a target, with the loss."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -28,13 +28,13 @@ class Export:
     content: bytes
     """The file."""
     numbers: Numbers
-    """What it holds of the calibration."""
+    """Its content of the calibration."""
     placement: Placement
     """Frame, origin and axes of these numbers."""
     loss: Loss
-    """What is lost."""
+    """Loss of the export."""
     lines: tuple[str, ...]
-    """What to know about it: the same in the file and on the terminal."""
+    """Notes: the same in the file and on the terminal."""
     refused: Mapping[str, str] = field(default_factory=dict)
     """Sensor whose numbers are those of a data sheet -> why."""
 
@@ -49,15 +49,15 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     """
     Return the file of a target.
 
-    A sensor that compensation does not correct has the nominal numbers; its loss is the whole error by the calibration. A target that
-    holds the whole document includes its decisions.
+    A sensor that compensation does not correct has the nominal numbers; its loss is the whole error by the calibration. For a target that
+    contains the complete document, with its decisions.
 
     Parameters
     ----------
     calibration : Calibration
     target : Target
     noise : NoiseFigures, optional
-        From a noise document; without one the white noise of the calibration's recording is taken, and no random walk is known.
+        From a noise document; without one the white noise of the calibration's recording is used, without random walks.
     rate : float, optional
         Rate at which the target gets the readings, Hz; default that of the noise document.
     motion : TrialMotion, optional
@@ -70,7 +70,7 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     InputError
         When the target needs noise that is not there, or the calibration cannot be brought into its axes.
     DocumentError
-        When nobody should be corrected with the calibration.
+        When no sensor should be corrected with the calibration.
 
     """
     used = Usable(calibration) if target.whole or target.only_noise else usable(calibration, anyway=anyway)
@@ -101,12 +101,12 @@ def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement,
 
 
 def _with_arms_and_matrices(calibration, held) -> AffineImu:
-    """Return the IMU by which a target chooses its axes: with whole matrices, also where it holds diagonals only."""
+    """Return the IMU by which a target chooses its axes: with full matrices, also where it has diagonals only."""
     return affine_of(calibration, MATRICES + ARMS) if np.any(held.arms) else affine_of(calibration, MATRICES)
 
 
 def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, list[str]]:
-    """Return (noise in the target's words or None, what is not known of it)."""
+    """Return (noise in the target's terms or None, notes on unknown figures)."""
     if target.noise is None:
         return None, []
     found = _noise_of(calibration, figures, rate)
@@ -125,7 +125,7 @@ def _trust_lines(used: Usable) -> list[str]:
 
 
 def _walk_lines(noise: Noise) -> list[str]:
-    """Say of random walks that were not found as such what they are."""
+    """Describe random walks that are equivalents or bounds."""
     basis = {sensor: getattr(noise, sensor).basis for sensor in SENSORS}
     return [f'random walk of the {sensor}: {BASIS[found]}' for sensor, found in basis.items() if found != 'walk']
 
@@ -146,7 +146,7 @@ def _noise_of(calibration, figures, rate) -> Noise | None:
 
 
 def _placement_lines(calibration, target, placement) -> list[str]:
-    """Say where the numbers stand against our sensor frame."""
+    """Describe the frame of the numbers relative to the sensor frame."""
     name = calibration.frame_id or UNNAMED
     if target.only_noise:
         return []
@@ -172,7 +172,7 @@ def _worked_sample(target, numbers, placement, calibration) -> list[str]:
 
 
 def loss_lines(target: Target, loss: Loss) -> list[str]:
-    """Return what is lost, a line each."""
+    """Return the losses, a line each."""
     if target.only_noise:
         left = ', '.join(f'{sensor} {significant(value)} {UNIT[sensor]}' for sensor, value in loss.left.items())
         beside = ' in addition to a constant bias' if target.estimates else ''
@@ -197,7 +197,7 @@ def _names(effects) -> str:
 
 
 def holds_in_words(target: Target) -> str:
-    """Return what a target can hold, in a few words."""
+    """Return a short description of a target's capacity."""
     if target.whole:
         return 'everything'
     parts: dict[str, list[str]] = {}

@@ -35,7 +35,7 @@ def upper_times_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def as_mounted(_imu: AffineImu) -> Placement:
-    """Return the placement of a program that takes our axes as they are."""
+    """Return the placement of a program with unchanged axes."""
     return Placement()
 
 

@@ -1,4 +1,4 @@
-"""Which effects of the catalogue a program can hold, told by their place in the sensor's equation and by their columns."""
+"""Which effects of the catalogue a program can represent, by their role in the sensor's equation and by their columns."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ class Holding:
     role: Role = Role.TERM
     """Their place in the sensor's equation."""
     groups: tuple[ColumnGroup, ...] = ()
-    """Columns of those that are terms."""
+    """Columns of effects that are terms."""
     own_axis: bool = False
     """Whether of a matrix only the diagonal can be held."""
 
@@ -28,7 +28,7 @@ class Holding:
         return effect.sensor == self.sensor and effect.role is self.role and (self.role is not Role.TERM or effect.groups == self.groups)
 
     def held(self, values: np.ndarray) -> np.ndarray:
-        """Return what can be held of an effect's values, shape as given."""
+        """Return the representable part of an effect's values, shape as given."""
         return np.diag(np.diag(values.reshape(3, 3))).reshape(values.shape) if self.own_axis else values
 
     @property
@@ -48,7 +48,7 @@ THERMAL_OFFSETS = _both(groups=(regressors.TEMPERATURE,))
 G_SENSITIVITY = (Holding('gyroscope', Role.CROSS),)
 ARMS = (Holding('accelerometer', Role.ARMS),)
 SLOW_OFFSETS = OFFSETS + THERMAL_OFFSETS
-"""What an estimator that carries biases in its state finds by itself."""
+"""Effects that an estimator with biases in its state estimates itself."""
 
 
 def of(sensor: str, holdings: tuple[Holding, ...]) -> tuple[Holding, ...]:

@@ -1,4 +1,4 @@
-"""From the file of another program to a calibration document, in which nothing is claimed that the file does not say."""
+"""Import of the file of another program as a calibration document, without claims beyond the file."""
 
 from typing import Any
 
@@ -17,14 +17,14 @@ from imu_calibration.exports.pose import find_pose
 from imu_calibration.exports.target import Read, Target
 
 
-@np.errstate(all='ignore')   # `check_numbers` refuses what is not finite
+@np.errstate(all='ignore')   # `check_numbers` refuses non-finite values
 def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = '') -> Calibration:
     """
     Return the calibration in a file of another program.
 
-    Values are those of the file; where it says how its frame stands against the sensor's, as files of an export do, they are turned back.
-    Standard deviations are those of the priors, since the file has none: a value that stands in the file is
-    weak, what cannot stand there is held at its prior. Without a proof each sensor is unproven.
+    Values are those of the file; where it states its rotation to the sensor frame, as exported files do, they are rotated back.
+    Standard deviations are those of the priors, since the file has none: a value in the file is
+    weak, a value that the format lacks is fixed at its prior. Without a proof each sensor is unproven.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a program cannot hold of a calibration, and the error which that leaves."""
+"""The part of a calibration that a program cannot represent, and the resulting error."""
 
 from dataclasses import dataclass
 
@@ -26,15 +26,15 @@ class LostEffect:
     in_part: bool
     """Whether a part of it is held."""
     rms: float
-    """Root mean square of what it makes in the readings, per component, SI."""
+    """Root mean square of its contribution to the readings, per component, SI."""
 
 
 @dataclass(frozen=True, eq=False)
 class Loss:
-    """What an export loses on a motion."""
+    """Loss of an export on a motion."""
 
     effects: tuple[LostEffect, ...]
-    """What is not held, in the catalogue's order."""
+    """Effects that are not represented, in the catalogue's order."""
     estimated: tuple[Effect, ...]
     """Effects that the program finds by itself; they count as known here."""
     left: dict[str, float]
@@ -42,27 +42,27 @@ class Loss:
     raw: dict[str, float]
     """Sensor -> rms difference per component between raw readings and the full compensation, SI."""
     motion: str
-    """The motion, in words."""
+    """Description of the motion."""
 
     @property
     def nothing(self) -> bool:
-        """Whether the program's readings are those of the full compensation."""
+        """Whether the program's readings equal the full compensation."""
         return not self.effects and max(self.left.values()) < NOTHING
 
 
 def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, placement: Placement, motion: TrialMotion) -> Loss:
     """
-    Return what a target loses of a calibration on a motion.
+    Return the loss of a target on a motion.
 
-    Readings are made by the whole model that compensation inverts, without noise; those effects that the target estimates are taken out of
-    them; the target's own formula makes its readings of them, which are compared with the true motion in its frame, at its origin.
+    Readings are simulated without noise by the model that compensation inverts. The effects that the target estimates are removed from
+    them; the target's formula is applied; the result is compared with the true motion in its frame, at its origin.
 
     Parameters
     ----------
     target : Target
     calibration : Calibration
     numbers : dict
-        What the target's file holds.
+        Content of the target's file.
     placement : Placement
         Frame, origin and axes of its numbers.
     motion : TrialMotion
@@ -78,7 +78,7 @@ def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, place
     seen = {sensor: sensor_output(model, sensor, without, ref=ref) for sensor in SENSORS}
     true = placement.truth(ref.force_s, ref.rate_s, ref.alpha_s)
     if target.whole:
-        made = true   # it carries all that the full compensation asks for
+        made = true   # it represents all effects of the full compensation
     else:
         force, rate = placement.readings(*seen.values())
         readings = Readings(force, rate, ref.alpha_s @ placement.mat_ts.T, motion.temperature_c)
@@ -95,7 +95,7 @@ def _whole(calibration, effect, holds: tuple[Holding, ...]):
 
 
 def _lost(calibration, effect, holds, motion):
-    """Return how much of the readings an effect makes beyond what is held of it."""
+    """Return the part of the readings due to the part of an effect that is not represented."""
     model, values = invertible_values(calibration)
     holding, less = holding_of(effect, holds), values.copy()
     less[model.slices[effect.key]] = held_values(calibration, effect, holding)

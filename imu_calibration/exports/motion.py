@@ -16,9 +16,9 @@ SECONDS, SAMPLES_PER_SECOND = 60.0, 50
 FREQUENCIES = np.array([0.3, 0.4, 0.5])
 """Hz; of the rates about x, y, z."""
 USUAL_RATE = 1.0
-"""rad/s; where a document does not say how fast its motion was."""
+"""rad/s; default for a document without the speed of its motion."""
 TURNS = 15
-"""Turns of the spiral on which gravity goes from nadir to zenith."""
+"""Turns of the spiral of gravity from nadir to zenith."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class TrialMotion:
     temperature_c: np.ndarray
     """Temperature, degrees Celsius, shape (n,)."""
     text: str
-    """What it is, for people."""
+    """Description."""
 
 
 def motion_of(force: np.ndarray, rate: np.ndarray, alpha: np.ndarray, *, temperature_c: np.ndarray, text: str) -> TrialMotion:
@@ -42,7 +42,7 @@ def motion_of(force: np.ndarray, rate: np.ndarray, alpha: np.ndarray, *, tempera
 
 def standard_motion(calibration: Calibration) -> TrialMotion:
     """
-    Return the declared motion of a calibration: a minute with gravity in all directions and rates as large as those that it saw.
+    Return the declared motion of a calibration: a minute with gravity in all directions and rates as large as in its recording.
 
     Gravity runs along a spiral from nadir to zenith; each rate swings with the calibration's largest rate, or 1 rad/s, at 0.3 to 0.5 Hz;
     the temperature runs through the calibration's range. The three are drawn independently of one another.
@@ -68,12 +68,12 @@ def recorded_motion(calibration: Calibration, imu: ImuSamples, temperature: Temp
     """
     Return the motion of a recording as the calibration sees it: its compensated readings.
 
-    Angular acceleration is the slope of the compensated rates, by the filter that compensation takes.
+    Angular acceleration is the slope of the compensated rates, by the filter of the compensation.
 
     Raises
     ------
     InputError
-        When nothing of it can be compensated.
+        When no part of it can be compensated.
 
     """
     corrected = CompensationStream(calibration, temperature=temperature).correct(imu)

@@ -12,7 +12,7 @@ PUBLISHER = 'static_transform_publisher'
 NUMBERS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
 PARENT, CHILD = 'frame-id', 'child-frame-id'
 UNNAMED = 'sensor_frame'
-"""Stands for our sensor frame where the calibration has no name for it."""
+"""Name of the sensor frame where the calibration has none."""
 
 
 def pose_line(placement: Placement, parent: str, child: str) -> str:
@@ -23,7 +23,7 @@ def pose_line(placement: Placement, parent: str, child: str) -> str:
 
 
 def find_pose(content: bytes) -> tuple[Placement, str] | None:
-    """Return (placement, our frame) of the first such line in a file, None where there is none: in files that others wrote."""
+    """Return (placement, our frame) of the first such line in a file, None where there is none: in files of other programs."""
     line = re.search(rf'{PUBLISHER} (.*)', content.decode(errors='replace'))
     try:
         words = shlex.split(line.group(1).partition('"')[0]) if line else []

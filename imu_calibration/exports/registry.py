@@ -31,7 +31,7 @@ def find_target(name: str) -> Target:
 
 def find_reader(name: str) -> Target:
     """
-    Return the target of a name whose files can be read.
+    Return the target of a name; its files must be readable.
 
     Raises
     ------

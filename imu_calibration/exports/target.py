@@ -1,4 +1,4 @@
-"""What a target of an export is: one record that says all of one program, its own formula included."""
+"""The target of an export: one record of all properties of a program, its formula included."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,14 +17,14 @@ Numbers = dict[str, Any]
 
 
 class Readings(NamedTuple):
-    """What an IMU gave, in the axes of a program."""
+    """Readings of an IMU, in the axes of a program."""
 
     force: np.ndarray
     """Measured specific force, m/s^2, shape (n, 3)."""
     rate: np.ndarray
     """Measured rate, rad/s, shape (n, 3)."""
     alpha: np.ndarray
-    """True angular acceleration in the program's frame, rad/s^2, shape (n, 3): what estimators have from their own trajectory."""
+    """True angular acceleration in the program's frame, rad/s^2, shape (n, 3): estimators have it from their trajectory."""
     temperature_c: np.ndarray
     """Degrees Celsius, shape (n,)."""
 
@@ -40,45 +40,45 @@ class Noise:
     rate: float
     """Sampling rate, Hz."""
     walk_known: bool = True
-    """Whether the random walks are known: those of a noise document are, a calibration knows the white noise only."""
+    """Whether the random walks are known: a noise document has them, a calibration has the white noise only."""
 
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """What a writer puts into a file."""
+    """Input of a writer."""
 
     numbers: Numbers
     """Of the calibration, by `Target.numbers`."""
     noise: Numbers | None
     """Of the noise, by `Target.noise`; None: not known."""
     comments: list[str]
-    """Lines to stand before the numbers."""
+    """Lines before the numbers."""
     calibration: Calibration
-    """What is exported."""
+    """The exported calibration."""
     rate: float | None
     """Sampling rate, Hz, where known."""
 
 
 @dataclass(frozen=True, eq=False)
 class Read:
-    """What a reader found in a file."""
+    """Content of a file."""
 
     numbers: Numbers
     """As `Target.numbers` makes them."""
     lacks: tuple[Holding, ...] = ()
-    """What the program could hold and this file does not."""
+    """Effects that the program supports and this file lacks."""
     sample_sd: dict[str, float] = field(default_factory=dict)
-    """Sensor -> standard deviation of the noise of a sample, where the file says it."""
+    """Sensor -> standard deviation of the noise of a sample, where the file has it."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Target:
-    """A program that takes numbers of an IMU."""
+    """A program with IMU parameters."""
 
     name: str
-    """By which it is asked for."""
+    """Identifier on the command line."""
     title: str
-    """What it is, for people."""
+    """Title to print."""
     formula: str
     """How the program uses the numbers, in its own names."""
     source: str
@@ -86,17 +86,17 @@ class Target:
     holds: tuple[Holding, ...] = ()
     """Effects that it can hold."""
     estimates: tuple[Holding, ...] = ()
-    """Effects that it finds by itself while it runs: no loss, whatever the file says."""
+    """Effects that it estimates at run time: no loss, independent of the file."""
     whole: bool = False
-    """Whether it holds the whole document: `numbers` are then the document's mapping."""
+    """Whether it has the complete document: `numbers` are then the document's mapping."""
     placement: Callable[[AffineImu], Placement] = as_mounted
     """Its frame, origin and axes of readings."""
     numbers: Callable[[AffineImu], Numbers] = lambda _imu: {}
-    """The numbers of an IMU that stands in its placement."""
+    """The numbers of an IMU in its placement."""
     corrected: Callable[[Numbers, Readings], tuple[np.ndarray, np.ndarray]] = lambda _numbers, readings: (readings.force, readings.rate)
     """The program's own formula: specific force and rate that it makes of readings with these numbers."""
     noise: Callable[[Noise], Numbers] | None = None
-    """The noise in its names and units; None: it takes none."""
+    """The noise in its names and units; None: it uses none."""
     noise_is: str = ''
     """Which noise that is: continuous or discrete, with units."""
     needs_walk: bool = True
@@ -106,19 +106,19 @@ class Target:
     write: Callable[[Page], str | bytes] | None = None
     """The file; None: its files are read only."""
     read: Callable[[bytes, Any], Read] | None = None
-    """``read(content, path)``; None: nothing of the calibration stands in its files."""
+    """``read(content, path)``; None: its files have no calibration."""
     imu: Callable[[Numbers], AffineImu] | None = None
     """The IMU of numbers, in the program's placement: the other way of `numbers`."""
     back: Callable[[AffineImu], Placement] = as_mounted
     """The placement of our calibration against an IMU that was read."""
     axes: str = 'mount'
-    """The axes of a calibration that was read, as its gauge says them."""
+    """The axes of an imported calibration, named as its gauge."""
     ignored: Callable[[Numbers], list[str]] = lambda _numbers: []
-    """What of these numbers the program does not take notice of, and its limits, a line each."""
+    """Numbers that the program ignores, and its limits, a line each."""
     hint: str = ''
-    """What to do with the file, or with the program."""
+    """Instructions for the file or the program."""
 
     @property
     def only_noise(self) -> bool:
-        """Whether it takes noise and nothing of the calibration."""
+        """Whether it uses noise only, without the calibration."""
         return self.noise is not None and not self.holds and not self.whole

@@ -19,7 +19,7 @@ def commented(lines: list[str], mark: str = '# ') -> str:
 
 
 def yaml_file(comments: list[str], mapping: dict, head: str = '') -> str:
-    """Return a YAML file with comments before the content; `head` is a line that must come first."""
+    """Return a YAML file with comments before the content; `head` is a line that must be first."""
     return head + commented(comments) + to_text(plain(mapping))
 
 
@@ -35,7 +35,7 @@ def plain(value: Any) -> Any:
 
 
 def read_yaml(content: bytes, what: str) -> dict:
-    """Return the mapping in a YAML file; the line ``%YAML:1.0`` of OpenCV may stand before it."""
+    """Return the mapping in a YAML file; the line ``%YAML:1.0`` of OpenCV may precede it."""
     lines = text_of(content, what).splitlines()
     kept = '\n'.join(line for line in lines if not line.startswith('%YAML'))
     return from_text(kept, what)
@@ -93,7 +93,7 @@ def read_parameters(content: bytes, what: str) -> dict[str, float]:
     """
     Return {name: value} from a list of parameters, one a line, comments after ``#``.
 
-    The last word of a line is the value in ArduPilot's lists (``NAME,VALUE``), the fourth in QGroundControl's
+    The last field of a line is the value in ArduPilot's lists (``NAME,VALUE``), the fourth in QGroundControl's
     (``vehicle component NAME VALUE type``).
     """
     found = {}
@@ -112,7 +112,7 @@ def read_parameters(content: bytes, what: str) -> dict[str, float]:
 
 
 def vector_of(found: dict[str, float], name: str, missing: float = 0.0) -> np.ndarray:
-    """Return the parameters of the three axes, whose letter stands for ``*`` in the name, shape (3,)."""
+    """Return the parameters of the three axes, whose letter replaces ``*`` in the name, shape (3,)."""
     return np.array([found.get(name.replace('*', axis), missing) for axis in XYZ])
 
 

@@ -92,7 +92,7 @@ def read(content: bytes, _path: str | Path) -> Read:
 
 
 def ignored(found: dict) -> list[str]:
-    """Return what lies outside the ranges that ArduPilot takes."""
+    """Return the values outside the ranges of ArduPilot."""
     lines = []
     offset, scale = vector_of(found, OFFSET['accelerometer'] + '_*'), vector_of(found, SCALE + '_*', 1.0)
     if np.any(np.abs(offset) > LARGEST_OFFSET):

@@ -1,4 +1,4 @@
-"""Autoware: parameters of imu_corrector, and the scale factors that it takes from a topic."""
+"""Autoware: parameters of imu_corrector, and the scale factors that it subscribes to."""
 
 import re
 from pathlib import Path

@@ -15,7 +15,7 @@ LOWER_BY_COLUMNS = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
 
 
 def numbers(imu: AffineImu) -> dict:
-    """Return biases (behind the matrix) and matrices minus identity: a lower triangle, and the whole for the gyroscope, by columns."""
+    """Return biases (after the matrix) and matrices minus identity, by columns: a lower triangle; the full matrix for the gyroscope."""
     inverse = {sensor: np.linalg.inv(matrix) for sensor, matrix in imu.matrix.items()}
     bias = {sensor: inverse[sensor] @ imu.bias[sensor] for sensor in inverse}
     extra = {sensor: matrix - np.eye(3) for sensor, matrix in inverse.items()}
@@ -53,7 +53,7 @@ def noise(found: Noise) -> dict:
 
 
 def write(page: Page) -> str:
-    """Return the JSON; comments stand behind the content, where basalt does not look."""
+    """Return the JSON; comments follow the content, where basalt does not read."""
     return json.dumps(plain({'value0': {**page.numbers, **(page.noise or {})}, 'comments': page.comments}), indent=2) + '\n'
 
 

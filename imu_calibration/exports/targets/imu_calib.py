@@ -11,7 +11,7 @@ from imu_calibration.exports.text import numbers_at, read_yaml, yaml_file
 
 
 def numbers(imu: AffineImu) -> dict:
-    """Return SM by rows and the bias, which is subtracted behind the matrix."""
+    """Return SM by rows and the bias, which is subtracted after the matrix."""
     inverse = np.linalg.inv(imu.matrix['accelerometer'])
     return {'SM': inverse.ravel(), 'bias': inverse @ imu.bias['accelerometer']}
 

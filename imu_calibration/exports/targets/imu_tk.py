@@ -37,7 +37,7 @@ def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read(content: bytes, path: str | Path) -> Read:
-    """Read the file that is named and, when it is there, the one of the other sensor beside it."""
+    """Read the named file and, if present, that of the other sensor in the same folder."""
     path = Path(path)
     own = next((sensor for sensor, ending in ENDINGS.items() if path.suffix == ending), 'accelerometer')
     found = {own: _numbers(content)}

@@ -84,7 +84,7 @@ def read_densities(mapping: dict[str, Any]) -> dict[str, float]:
 
 
 def read(content: bytes, _path: str | Path) -> Read:
-    """Read what kalibr_calibrate_imu_camera writes (``imu0: ...``) and what `write` writes."""
+    """Read files of kalibr_calibrate_imu_camera (``imu0: ...``) and of `write`."""
     what = 'Kalibr result'
     mapping = read_yaml(content, what)
     mapping = section(mapping, 'imu0', what) if 'imu0' in mapping else mapping

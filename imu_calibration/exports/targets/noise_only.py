@@ -1,4 +1,4 @@
-"""Visual, lidar and wheel estimators that take noise and nothing of a calibration: they get compensated readings."""
+"""Visual, lidar and wheel estimators with noise parameters only; their input is compensated readings."""
 
 from functools import partial
 
@@ -14,14 +14,14 @@ def _gravity(page: Page) -> float:
 
 
 def vins(found: Noise) -> dict:
-    """Return the noise for the midpoint rule, which weighs each of two samples with half a step and multiplies walks with a whole one."""
+    """Return the noise for the midpoint rule, which weights each of two samples with half a step and multiplies walks by a full one."""
     accel, gyro = found.accelerometer, found.gyroscope
     return {'acc_n': accel.white * (2 * found.rate)**0.5, 'gyr_n': gyro.white * (2 * found.rate)**0.5,
             'acc_w': accel.walk * found.rate**0.5, 'gyr_w': gyro.walk * found.rate**0.5}
 
 
 def lio_sam(found: Noise) -> dict:
-    """Return continuous densities, as gtsam's preintegration takes them."""
+    """Return continuous densities, as used by gtsam's preintegration."""
     accel, gyro = found.accelerometer, found.gyroscope
     return {'imuAccNoise': accel.white, 'imuGyrNoise': gyro.white, 'imuAccBiasN': accel.walk, 'imuGyrBiasN': gyro.walk}
 

@@ -17,7 +17,7 @@ NAMES = ('Tw', 'R_IMUtoGYRO', 'Ta', 'R_IMUtoACC', 'Tg')
 
 
 def numbers(imu: AffineImu, shape: str) -> dict:
-    """Return triangular matrices and the turns to them; the IMU's axes stay ours, so that no extrinsic changes."""
+    """Return triangular matrices and the rotations to them; the IMU's axes are unchanged, so that no extrinsic changes."""
     (ta, to_acc), (tw, to_gyro) = (SHAPES[shape](imu.matrix[sensor]) for sensor in ('accelerometer', 'gyroscope'))
     return {'Tw': tw, 'R_IMUtoGYRO': to_gyro, 'Ta': ta, 'R_IMUtoACC': to_acc, 'Tg': imu.cross}
 
@@ -43,7 +43,7 @@ def write(page: Page, model: str) -> str:
 
 
 def read(content: bytes, _path: str | Path) -> Read:
-    """Read a chain; what it leaves out is the identity, or zero, as in OpenVINS."""
+    """Read a chain; missing entries are the identity, or zero, as in OpenVINS."""
     what = 'OpenVINS chain'
     chain = section(read_yaml(content, what), 'imu0', what)
     found = {name: np.zeros((3, 3)) if name == 'Tg' else np.eye(3) for name in NAMES}

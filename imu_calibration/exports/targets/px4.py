@@ -17,7 +17,7 @@ TC = {'accelerometer': 'TC_A', 'gyroscope': 'TC_G'}
 DEFAULT_RANGE = (0.0, 100.0)
 """Degrees Celsius; PX4's own range of thermal compensation."""
 UNNOTICED = 0.01
-"""Norm up to which PX4 takes an offset (m/s^2, rad/s) or a scale for unchanged; 0.001 in older versions."""
+"""Norm up to which PX4 ignores a change of an offset (m/s^2, rad/s) or a scale; 0.001 in older versions."""
 INTEGER, REAL = 6, 9
 """Types of MAVLink."""
 
@@ -90,7 +90,7 @@ def read(content: bytes, _path: str | Path) -> Read:
 
 
 def ignored(found: dict) -> list[str]:
-    """Return what PX4 takes for unchanged."""
+    """Return the changes that PX4 ignores."""
     lines = []
     for sensor, ending, nominal in (('accelerometer', 'OFF', 0.0), ('accelerometer', 'SCALE', 1.0), ('gyroscope', 'OFF', 0.0)):
         change = float(np.linalg.norm(vector_of(found, f'{CAL[sensor]}_*{ending}', nominal) - nominal))

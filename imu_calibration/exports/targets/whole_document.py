@@ -1,4 +1,4 @@
-"""JSON and MATLAB: the whole document for programs that read neither YAML nor this package."""
+"""JSON and MATLAB: the complete document for programs that read neither YAML nor this package."""
 
 import io
 import json
@@ -19,7 +19,7 @@ DOCUMENT = 'document_json'
 
 
 def write_json(page: Page) -> str:
-    """Return calibration.yaml as JSON, with the comments beside it."""
+    """Return calibration.yaml as JSON, with the comments as an entry."""
     return json.dumps({**plain(page.numbers), 'comments': page.comments}, indent=1) + '\n'
 
 
