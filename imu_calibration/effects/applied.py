@@ -19,7 +19,7 @@ def not_applied(model: SensorModel) -> list[Effect]:
 
 
 def in_time(effect: Effect) -> bool:
-    """Return whether an effect depends on time alone."""
+    """Return whether an effect depends on time only."""
     return all(group.uses <= {'time', 'time constant'} for group in effect.groups)
 
 

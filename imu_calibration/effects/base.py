@@ -1,4 +1,4 @@
-"""What an effect is: one physical cause of sensor output, declared once."""
+"""The effect: one physical cause of sensor output, declared once."""
 
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -43,7 +43,7 @@ class Role(Enum):
     DELAY = auto()
     """By how much the stamps are late."""
     TILT = auto()
-    """How the table stands."""
+    """Tilt of the table."""
     TERM = auto()
     """A term, or a warp, of its own."""
 
@@ -53,15 +53,15 @@ class Effect:
     """
     One physical cause of sensor output.
 
-    A *sensor* effect acts on one sensor. It has column groups (`effects.column_group`) and gives, for values of the whole
-    sensor's parameters, the coefficients of those columns, so that ``output = sum(columns @ coefficients)``. Products
+    A *sensor* effect acts on one sensor. It has column groups (`effects.column_group`) and computes, from the values of all
+    parameters of the sensor, the coefficients of these columns, so that ``output = sum(columns @ coefficients)``. Products
     of parameters (matrix times arm) become coefficients of columns of their own; a triangular factor of the columns is
     then an exact summary of the data.
 
     A *reference* effect (and a sensor's own lag) instead changes the motion that the sensor is thought to have felt: `warp`
     gives tables and motions with weights, of which the reference is the weighted mean.
 
-    Whatever other parts need to know of an effect is a field here: nothing is read out of its name.
+    All properties of an effect are fields here; none is derived from its name.
     """
 
     name: str
@@ -77,15 +77,15 @@ class Effect:
     tolerance: float
     """Standard deviation up to which a component counts as determined; a user's file of tolerances overrides it."""
     tolerance_reason: str = ''
-    """Where the tolerance comes from; printed beside it in config/tolerances.yaml."""
+    """Source of the tolerance; printed with it in config/tolerances.yaml."""
     prior: Any = 0.0
-    """Prior value of every component (or a sequence, one each); where columns depend on it they are first taken here."""
+    """Prior value of every component (or a sequence, one each); where columns depend on it they are first linearised here."""
     prior_sd: Any
     """Standard deviation of the prior (or a sequence, one each)."""
     explanation: str
     """One sentence for a test engineer."""
     title: str = ''
-    """Heading in a report; the name in words where empty."""
+    """Heading in a report; derived from the name where empty."""
     motion: tuple
     """Standard motions (`estimation.standard_motions`) that show it."""
     compensation: str
@@ -111,23 +111,23 @@ class Effect:
     plausible: tuple = ()
     """Plausible size by grade: (grade, largest, source), in `unit`."""
     time_constant: bool = False
-    """Whether the last component is a time constant, s, on which the columns depend, and the others are amplitudes."""
+    """Whether the last component is a time constant, s, on which the columns depend, and all preceding ones are amplitudes."""
     nonnegative: bool = False
-    """Whether the values cannot be negative, as those of a lag."""
+    """Whether the values cannot be negative, e.g. lags."""
     smooth: bool = False
     """Whether it changes smoothly in time: any other smooth curve resembles it."""
     against: tuple = ()
-    """What its residual is drawn against: 'time', 'temperature', 'force', 'rate', 'angle'; empty: its own signal."""
+    """Abscissa of its residual plot: 'time', 'temperature', 'force', 'rate', 'angle'; empty: its own signal."""
     contained_in: str = ''
     """Effect of the same sensor of which it is a special case."""
     known_size: bool = False
     """Whether the plausible size is the true one, as for the Earth's rate: a larger value is no explanation."""
     moot: Callable | None = None
-    """``moot(table) -> (why, what to do) or None``: why it cannot be asked about with this table."""
+    """``moot(table) -> (why, what to do) or None``: why it cannot be tested with this table."""
     in_reference: bool = False
     """Whether a document lists an effect of a sensor under `reference`: it belongs to the table and the session."""
     nuisance: bool = False
-    """Whether it is estimated for the sake of the others only, so that nobody asks for its value."""
+    """Whether it is a nuisance parameter, estimated but not requested."""
     definition: dict | None = None
     """The plain data that it was made of (`effects.term`), which may travel in documents; None for the catalogue's own."""
 
@@ -140,7 +140,7 @@ class Effect:
 
     @property
     def key(self) -> tuple[str, str]:
-        """(sensor, name), by which models and catalogues know it."""
+        """(sensor, name), its key in models and catalogues."""
         return self.sensor, self.name
 
     @property
@@ -150,7 +150,7 @@ class Effect:
 
     @property
     def heading(self) -> str:
-        """Its title, or its name in words."""
+        """Its title, or a title from its name."""
         return self.title or self.name.replace('_', ' ')
 
     @property
@@ -174,11 +174,11 @@ class Effect:
 
     @property
     def largest(self) -> float:
-        """Largest plausible size, infinite where nothing is known."""
+        """Largest plausible size, infinite if unknown."""
         return max((limit for _, limit, _ in self.plausible), default=np.inf)
 
     def surpasses(self, amplitudes: np.ndarray, sd: np.ndarray | float = 0.0) -> bool:
-        """Return whether amplitudes are beyond what any instrument is known for, by more than three standard deviations."""
+        """Return whether amplitudes exceed those of any known instrument by more than three standard deviations."""
         return bool(np.max(np.abs(amplitudes) - 3 * sd) > KNOWN * self.largest)
 
     def prior_values(self) -> np.ndarray:
@@ -194,7 +194,7 @@ class Effect:
         return values[:-1] if self.time_constant else values
 
     def at_time_constant(self, constant: float) -> np.ndarray:
-        """Return the prior values with another time constant, shape (size,): where a bank takes the columns."""
+        """Return the prior values with another time constant, shape (size,): a point of linearisation of a bank."""
         return np.append(self.prior_values()[:-1], constant)
 
     def param_names(self) -> list[str]:

@@ -13,12 +13,12 @@ from imu_calibration.errors import InputError, did_you_mean, shortened
 from imu_calibration.reference.joint import JointNames
 
 JOINTS = ('outer', 'middle', 'inner')
-"""Joint names where no table says other ones."""
+"""Default joint names."""
 MOST_ADDED = 50
 """Effects that a document may add at most."""
 UNDONE_WITH = {'force', 'rate', 'angular acceleration', 'temperature', 'thermal branch', 'vibration',
                'reference temperature'}
-"""Quantities that compensation knows of a sample."""
+"""Quantities of a sample that compensation has."""
 
 
 @lru_cache(maxsize=8)
@@ -30,16 +30,16 @@ def _own_effects(joint_names):
 @dataclass(frozen=True, eq=False)
 class Catalogue:
     """
-    The effects that there are: those declared in this package, and those that somebody added.
+    All effects: declared in this package or added by the user.
 
-    It is a value: to add an effect makes another catalogue, which a SensorModel carries to wherever it goes.
+    It is immutable: adding an effect creates another catalogue, which is part of a SensorModel.
     """
 
     added: tuple = field(default=())
-    """Effects beside the package's own."""
+    """Effects in addition to the package's own."""
 
     def __reduce__(self):
-        """Travel by what was added."""
+        """Pickle the added effects only."""
         return Catalogue, (self.added,)
 
     def effects(self, joint_names: Sequence[str] = JOINTS) -> dict[tuple[str, str], Effect]:
@@ -71,7 +71,7 @@ class Catalogue:
         Raises
         ------
         InputError
-            When a name is taken, the sensor is unknown, or an effect that compensation shall undo has columns that it cannot know.
+            When a name exists, the sensor is unknown, or an effect to be compensated has columns that compensation cannot compute.
 
         """
         grown = self
@@ -81,7 +81,7 @@ class Catalogue:
         return grown
 
     def definitions(self, names: Collection[str]) -> dict[str, Any]:
-        """Return {effect name: plain data} of those among `names` that were added, for a document."""
+        """Return {effect name: plain data} of the added effects among `names`, for a document."""
         added = [effect for effect in self.added if effect.name in names]
         for effect in added:
             if effect.definition is None:
@@ -101,7 +101,7 @@ class Catalogue:
         Raises
         ------
         InputError
-            As `with_effects` and `term`; also when there are far too many.
+            As `with_effects` and `term`; also when there are too many.
 
         """
         if not isinstance(definitions, dict) or len(definitions) > MOST_ADDED:
@@ -111,12 +111,12 @@ class Catalogue:
 
     def with_document(self, document: dict[str, Any]) -> 'Catalogue':
         """
-        Return a catalogue with what a document defines under `effects`: a file of effects, or a calibration, which carries its own.
+        Return a catalogue with the effects defined in a document under `effects`: a file of effects, or a calibration.
 
         Raises
         ------
         InputError
-            When there is no such part, or when a file of effects holds something else too.
+            When there is no such part, or when a file of effects has other parts.
 
         """
         strange = [] if 'format' in document else sorted(str(key) for key in document if key != 'effects')

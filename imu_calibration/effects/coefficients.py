@@ -14,8 +14,8 @@ class Amplitudes:
     """
     Values straight before the columns: ``output_i = sum_k value_ik column_k``.
 
-    With three amplitudes and three columns each column may belong to one axis alone. A last value that is a time constant comes
-    with the columns' derivatives by it.
+    With three amplitudes and three columns each column may belong to one axis only. A last value that is a time constant is accompanied
+    by the columns' derivatives by it.
     """
 
     effect: str
@@ -23,7 +23,7 @@ class Amplitudes:
     group: str
     """Name of its columns."""
     own_axis: bool = False
-    """Whether column i acts on axis i alone."""
+    """Whether column i acts on axis i only."""
     time_constant: bool = False
     """Whether the last value is a time constant."""
 
@@ -56,7 +56,7 @@ class AlongAxis:
 
 @dataclass(frozen=True)
 class Products:
-    """Values before the last three of six products: those of different components."""
+    """Values before the last three of six products, which are of different components."""
 
     effect: str
     group: str
@@ -69,7 +69,7 @@ class Products:
 
 @dataclass(frozen=True)
 class OfOthers:
-    """Two values for each axis, before the columns of the two others."""
+    """Two values for each axis, before the columns of the two other axes."""
 
     effect: str
     group: str
@@ -101,7 +101,7 @@ class LeverArms:
     effect: str
 
     def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
-        """Return the coefficients; one arm stands for three."""
+        """Return the coefficients; one arm is repeated for three."""
         matrix, arms = values['matrix'].reshape(3, 3), np.broadcast_to(values[self.effect].reshape(-1, 3), (3, 3))
         return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}
 

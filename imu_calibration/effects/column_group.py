@@ -19,8 +19,8 @@ class ColumnGroup:
     """
     Columns that belong together, by one text for each.
 
-    The texts (`effects.expressions`) are all that anybody knows of them: arrays of columns, the compensation of a single sample and what
-    data the columns need follow from them. A group with a time constant `tau` has each column twice: itself, and its derivative by `tau`.
+    The texts (`effects.expressions`) define them completely: arrays of columns, the compensation of a sample and the data
+    that the columns need are derived from them. A group with a time constant `tau` has each column and its derivative by `tau`.
     """
 
     name: str
@@ -28,10 +28,10 @@ class ColumnGroup:
     text: tuple
     """One expression for each column."""
     owner: str = ''
-    """The effect whose last value is `tau`, where the text holds it."""
+    """The effect whose last value is `tau`, where the text contains it."""
 
     def __reduce__(self):
-        """Travel without what was worked out: code cannot be sent."""
+        """Pickle without cached values: code cannot be pickled."""
         return ColumnGroup, tuple(getattr(self, f.name) for f in fields(self))
 
     @cached_property

@@ -1,4 +1,4 @@
-"""The columns of a sensor: what its coefficients multiply, at the point where the model is linearised."""
+"""The columns of a sensor (the regressors of its coefficients), at the point of linearisation."""
 
 from collections.abc import Sequence
 
@@ -21,9 +21,9 @@ def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: J
     Parameters
     ----------
     values : dict, optional
-        Effect name -> values that replace the point of those effects.
+        Effect name -> values that replace the point of the effect.
     roughly : bool
-        Take a lag for a delay of the same first derivative: a filter, which is a mean over several, costs as many times as much.
+        Approximate a lag by a delay of the same first derivative; a filter averages several delays and costs as many times more.
 
     """
     branches = [(1.0, table, motion)]
@@ -109,8 +109,8 @@ def warp_columns(model: SensorModel, effect: Effect, sensor: str, *, references:
     if clock is not None and effect.sensor == sensor and not np.any(model.point_of(effect)):
         effect = clock   # a lag of zero is a delay to first order
     inputs, levers = [], []
-    # A search, which folds the arms, asks for so many warps that it takes half the references, and errs by the curvature over a step; what
-    # it only asks about it asks beside a delay instead of a filter.
+    # A search folds the arms and needs many warps: forward differences halve the references, with an error of the curvature over a step.
+    # Candidate effects are evaluated with a delay in place of a filter.
     asking = model.folded_arms is not None
     for above, below, width in _steps(effect, model.point_of(effect), forward=asking):
         ends = [references.at(sensor, effect, at, roughly=asking and not np.any(model.point_of(effect))) for at in (above, below)]
@@ -129,7 +129,7 @@ def _steps(effect, at, forward):
     """
     Yield (values above, values below, distance) for the derivative by each parameter.
 
-    What cannot be negative is not tried below zero.
+    Nonnegative values are not varied below zero.
     """
     for index in range(effect.size):
         step = np.zeros(effect.size)

@@ -1,8 +1,8 @@
 """
-Columns as text: plain arithmetic in the true motion, read by this module alone.
+Columns as text: plain arithmetic in the true motion, parsed by this module only.
 
-One text serves two purposes: it is worked out on arrays, as columns of a least-squares system, and taken apart into sums of products,
-from which the compensation of one sample is written. Text may come from a document, so that nothing but arithmetic passes.
+One text serves two purposes: it is evaluated on arrays, as columns of a least-squares system, and expanded into sums of products,
+from which the compensation of one sample is written. Text may be from a document; only arithmetic is accepted.
 """
 
 import ast
@@ -16,7 +16,7 @@ import numpy as np
 from imu_calibration.errors import InputError
 
 MOST_JOINTS = 7
-"""Joints that a column can speak of."""
+"""Largest number of joints in a column."""
 QUANTITIES: dict[str, dict[str, tuple]] = {
     'force': {f'f_{a}': ('force_s', k) for k, a in enumerate('xyz')},
     'rate': {f'w_{a}': ('rate_s', k) for k, a in enumerate('xyz')},
@@ -37,7 +37,7 @@ from the base outwards.
 """
 KNOWN = ('f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time, temperature_c, thermal_branch, '
          'vibration_x .. z, temperature_ref_c, tau')
-"""The names for people."""
+"""The names, for messages."""
 PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
 QUANTITY_OF = {name: quantity for quantity, names in QUANTITIES.items() for name in names}
 FUNCTIONS = ('abs', 'sign', 'sqrt', 'exp', 'expm1', 'log', 'sin', 'cos', 'tanh')
@@ -57,13 +57,13 @@ Sum = dict[tuple[str, ...], float]
 
 def read(text: str) -> ast.expr:
     """
-    Return the syntax tree of a column, with whatever is constant in it worked out.
+    Return the syntax tree of a column, with constants folded.
 
     Raises
     ------
     InputError
-        When it holds anything but numbers, ``+ - * / **``, brackets, the names in `PLACES` and the `FUNCTIONS` of one argument; it says
-        where.
+        When it contains anything but numbers, ``+ - * / **``, brackets, the names in `PLACES` and the `FUNCTIONS` of one argument; with
+        the position.
 
     """
     try:
@@ -85,7 +85,7 @@ def read(text: str) -> ast.expr:
 
 
 class _Refused(Exception):
-    """What a column may not hold, and where it stands."""
+    """A forbidden part of a column, and its position."""
 
     def __init__(self, place, why):
         super().__init__(why)
@@ -99,7 +99,7 @@ def _refusal(text, place, why):
 
 
 def _checked(node, text, depth):
-    """Return the node with constants folded into finite floats: a whole number could grow without end, a float raises."""
+    """Return the node with constants folded into finite floats: an integer could grow without limit, a float raises."""
     if depth > DEEPEST:
         raise _Refused(node.col_offset, 'too many brackets')
 
@@ -152,7 +152,7 @@ def may_fail(tree: ast.expr) -> bool:
 
 
 def called(node: ast.Call) -> str:
-    """Return the name of the function; `read` takes no other calls."""
+    """Return the name of the function; `read` accepts no other calls."""
     return node.func.id if isinstance(node.func, ast.Name) else ''
 
 
@@ -161,7 +161,7 @@ def array_function(trees: Sequence[ast.expr]) -> Callable:
     source = ast.Expression(ast.Tuple(list(trees), ast.Load()))
     code = compile(ast.fix_missing_locations(source), '<columns>', 'eval')
     known = {'__builtins__': {}, **{name: getattr(np, name) for name in FUNCTIONS}, 'abs': _abs, 'sign': _sign}
-    return lambda values: eval(code, known, values)   # the trees hold arithmetic alone: see `read`
+    return lambda values: eval(code, known, values)   # the trees contain only arithmetic: see `read`
 
 
 def _sign(x):
@@ -180,17 +180,17 @@ def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
     Parameters
     ----------
     known : dict
-        Name -> the sum of products that stands for it.
+        Name -> its sum of products.
 
     Raises
     ------
     InputError
-        When it holds a name that is not known, or far too many products.
+        When it contains an undefined name or too many products.
 
     """
     match node := tree:
         case ast.Constant():
-            return {(): float(node.value)}   # type: ignore[arg-type]   # `read` takes no others
+            return {(): float(node.value)}   # type: ignore[arg-type]   # `read` accepts no other
         case ast.Name():
             if node.id not in known:
                 raise InputError(f"a column that compensation undoes must do without '{node.id}' ({QUANTITY_OF[node.id]}), "
@@ -204,7 +204,7 @@ def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
             return {(f'(({argument} > 0) - ({argument} < 0))' if inline else f'{called(node)}({argument})',): 1.0}
         case ast.BinOp():
             return _of_two(node, known)
-    raise TypeError(f'{ast.dump(tree):.60} is no arithmetic')   # `read` lets none through
+    raise TypeError(f'{ast.dump(tree):.60} is no arithmetic')   # `read` accepts none
 
 
 def _of_two(node: ast.BinOp, known: dict[str, Sum]) -> Sum:
@@ -212,7 +212,7 @@ def _of_two(node: ast.BinOp, known: dict[str, Sum]) -> Sum:
     left = products(node.left, known)
     if isinstance(node.op, ast.Pow):
         result: Sum = {(): 1.0}
-        for _ in range(cast(ast.Constant, node.right).value):   # type: ignore[arg-type]   # `read` takes whole powers
+        for _ in range(cast(ast.Constant, node.right).value):   # type: ignore[arg-type]   # `read` accepts integer powers
             result = _multiplied(result, left)
         return result
     right = products(node.right, known)
@@ -225,7 +225,7 @@ def _of_two(node: ast.BinOp, known: dict[str, Sum]) -> Sum:
 
 
 def added(*sums: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float]:
-    """Return the sum of sums of products; what cancels is left out."""
+    """Return the sum of sums of products; products that cancel are omitted."""
     total = {}
     for terms in sums:
         for factors, coefficient in terms.items():
@@ -267,4 +267,4 @@ def _or_nan(function):
 
 SCALAR_FUNCTIONS = {'abs': abs, 'sign': lambda x: (x > 0) - (x < 0), 'divided': _or_nan(lambda a, b: a / b),
                     **{name: _or_nan(getattr(math, name)) for name in FUNCTIONS if hasattr(math, name)}}
-"""What the expressions of `products` call: of plain floats, NaN where there is no value."""
+"""Functions in the expressions of `products`: of plain floats, NaN where undefined."""

@@ -82,9 +82,9 @@ def effect_slopes(effect: Effect, of_sensor: dict[str, np.ndarray],
 def predict(model: SensorModel, values: np.ndarray, table: Table, *, motion: JointMotion,
             temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return what the IMU of this model would read, (force, rate), each shape (n, 3): the forward equations.
+    Return the readings of this model, (force, rate), each shape (n, 3): the forward equations.
 
-    Warps are taken exactly at `values`; saturation clips the result.
+    Warps are exact at `values`; saturation clips the result.
     """
     exact = model.at(values)
     outputs = []
@@ -109,7 +109,7 @@ def clip(model: SensorModel, sensor: str, values: np.ndarray, *, output: np.ndar
 
 def sensor_output(model: SensorModel, sensor: str, values: np.ndarray, *, ref: Reference) -> np.ndarray:
     """
-    Return the output for a given true motion, without warps: what compensation inverts, shape (n, 3).
+    Return the output for a given true motion, without warps, shape (n, 3); compensation inverts it.
 
     Parameters
     ----------

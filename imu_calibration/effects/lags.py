@@ -1,4 +1,4 @@
-"""Lags of the sensors: a filter or a delay between what is felt and what is sent."""
+"""Lags of the sensors: a filter or a delay between input and output."""
 
 from collections.abc import Sequence
 
@@ -17,8 +17,8 @@ def _second_order():
     """
     Return (weight, delay) pairs of the maximally flat second-order filter, in units of its delay.
 
-    ``1 / (1 + d s + d^2 s^2 / 2)`` answers a blow by ``2 e^-x sin x``, x = t / d, whose moments of order k over k! follow from the
-    denominator. The weights meet the first five of them: 6e-5 is left where frequency times delay is 0.3 rad, and joints' noise is not
+    ``1 / (1 + d s + d^2 s^2 / 2)`` has the impulse response ``2 e^-x sin x``, x = t / d, whose moments of order k over k! follow from the
+    denominator. The weights match the first five: the error is 6e-5 where frequency times delay is 0.3 rad, and joints' noise is not
     amplified.
     """
     moments = [1.0, 1.0]
@@ -36,7 +36,7 @@ _KINDS = {
     'filter': ('delay', SECOND_ORDER, 'has a second-order (Butterworth) low-pass filter: its output has a lag, '
                'and an unchanged amplitude up to near its edge'),
 }
-"""Ending of the name -> (component, (weight, delay) pairs, what the sensor does). All have the same first derivative."""
+"""Ending of the name -> (component, (weight, delay) pairs, description). All have the same first derivative."""
 
 
 class _Lag:
@@ -72,11 +72,11 @@ def lag_name(sensor: str, ending: str) -> str:
 
 LAGS = tuple(_lag_effect(sensor, ending) for ending in _KINDS for sensor in SENSORS)
 """
-First-order filter, pure delay and second-order filter of each sensor; what is alike where it is small is told apart where it is large.
+First-order filter, pure delay and second-order filter of each sensor; collinear where small, separable where large.
 """
 
 CLOCK = 'time_offset'
-"""What both sensors lag by alike: of the clocks."""
+"""Common lag of both sensors: an offset of the clocks."""
 CLOCKS = frozenset({'clock_rate'})
 """Lags of both sensors that change with time."""
 FAMILY = frozenset({CLOCK, *(effect.name for effect in LAGS)})
@@ -85,7 +85,7 @@ FAMILY = frozenset({CLOCK, *(effect.name for effect in LAGS)})
 
 def total_lags(names: Sequence[str], values: np.ndarray, covariance: np.ndarray) -> dict[str, tuple[float, float]]:
     """
-    Return sensor -> (what its output lags by in all, standard deviation), s, of sensors that lag.
+    Return sensor -> (total lag of its output, standard deviation), s, of sensors with a lag.
 
     The first derivative of all descriptions is the same, so this repeats where their names and shares do not.
 

@@ -1,4 +1,4 @@
-"""Models with a name, the models that are taken when nobody asks, and models as users write them."""
+"""Named models, default models, and parsing of models written by users."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -22,11 +22,11 @@ NAMED_MODELS = {
 }
 """Models with a name: Avrutov 2017 eq. 1, eq. 4; Zhang 2017 eq. 11-17; Avrutov 2017 eq. 7, eq. 10."""
 G_SENSITIVE = (*BASE, 'gyro_g_sensitivity')
-"""What is asked of the gyroscope by hand when the poses demand it."""
+"""Gyroscope model by hand when the poses require it."""
 BARE = 'axial'
-"""Name of the model from which a diagnosis starts: what was not asked for has to prove itself."""
+"""Name of the model from which a diagnosis starts; further effects need evidence."""
 DEFAULT = {'accelerometer': 'size_effect', 'gyroscope': 'rate'}
-"""What is asked of a recording on a table when nobody says more."""
+"""Default model of a recording on a table."""
 
 
 def parse_effects(sensor: str, text: str, joint_names: Sequence[str] = JOINTS, *, catalogue: Catalogue = CATALOGUE) -> tuple[str, ...]:
@@ -51,7 +51,7 @@ def parse_reference(text: str | None, table: Table) -> tuple[str, ...]:
     """
     Return effect names of table and clock from names joined by '+' or 'none'.
 
-    None: the tilt, the Earth's rate where the table does not tell it, and errors of the joints where the table says how large they may be.
+    None: the tilt, the Earth's rate unless the table defines it, and errors of the joints where the table has their tolerances.
     """
     if text is not None:
         return tuple(name for name in text.split('+') if name not in ('', 'none'))
@@ -67,6 +67,6 @@ def _is_moot(name: str, table: Table) -> bool:
 
 
 def with_common_arm(model: 'SensorModel') -> 'SensorModel':
-    """Return the model with a common lever arm beside the arms of the size effect; without a size effect as it is."""
+    """Return the model with a common lever arm beside the arms of the size effect; without a size effect unchanged."""
     lacks = model.find('accelerometer', Role.ARMS) and not model.find('accelerometer', Role.ARM)
     return model.with_effect('accelerometer', 'lever_arm') if lacks else model

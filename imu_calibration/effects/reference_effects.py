@@ -26,7 +26,7 @@ ORDERS = (1, 2)
 
 @lru_cache(maxsize=512)
 def _changed(change, table, values):
-    """Return the table that ``change(table, values)`` gives: each window of a recording asks for the same few hundred."""
+    """Return ``change(table, values)``, cached: each window of a recording needs the same few hundred."""
     return change(table, np.array(values))
 
 
@@ -50,12 +50,12 @@ def _places(table, motion, values):
 
 
 def _sag(table, motion, values):
-    """Let the axes behind the first one hang with their weight."""
+    """Bend the axes after the first one under their weight."""
     return [(1.0, _changed(with_sag, table, tuple(values)), motion)]
 
 
 def _wobble(table, motion, values):
-    """Let each axis lean as it turns."""
+    """Tilt each axis as it turns."""
     return [(1.0, _changed(with_wobble, table, tuple(values)), motion)]
 
 
@@ -93,7 +93,7 @@ def _earth(values, point):
 
 
 def _earth_known(table):
-    """Return why the Earth's rate cannot be asked about: nobody says where the table stands, or it is in the reference."""
+    """Return why the Earth's rate cannot be tested: the table's location is unknown, or the reference includes it."""
     if table.latitude is None:
         return ('the table gives no latitude, so the rotation of the Earth is not modelled',
                 'give latitude and height in the table description')

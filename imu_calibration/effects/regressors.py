@@ -36,7 +36,7 @@ LEVER = ColumnGroup('lever', (
 ATTITUDE = ColumnGroup('attitude', tuple(f'c_{a}{b}' for a in AXES for b in AXES))
 LOAD = {'accelerometer': ColumnGroup('load_turns_force', tuple(f'f_{AXES[j]} * f_{AXES[k]}' for j, k in PAIRS)),
         'gyroscope': ColumnGroup('load_turns_rate', tuple(f'f_{a} * w_{b}' for a in AXES for b in AXES))}
-"""What a mount that bends with load changes: force and rate are seen in a frame that turned with the force."""
+"""Columns of a mount that bends with load: force and rate are measured in a frame that rotates with the force."""
 CHANGE = {'accelerometer': ColumnGroup('force_change', ('f_y * w_z - f_z * w_y', 'f_z * w_x - f_x * w_z', 'f_x * w_y - f_y * w_x')),
           'gyroscope': ColumnGroup('rate_change', tuple(f'alpha_{a}' for a in AXES))}
 """The true input's derivative in time, of the force as gravity gives it to a sensor that turns."""

@@ -12,7 +12,7 @@ SHAKEN = 0.05
 
 
 def _one_axis(table):
-    """Return why lags between axes cannot be asked about: they show where motions about several axes mix."""
+    """Return why lags between axes cannot be tested: they show where motions about several axes mix."""
     if len(table.joint_names.turning) > 1:
         return None
     return 'the table turns about one axis only', 'record on a table that turns about two axes at once'

@@ -18,12 +18,12 @@ WARP, WARP_LEVER = 'warp:', 'warp_lever:'
 
 @dataclass(frozen=True, eq=False)
 class ColumnLayout:
-    """Columns of one sensor: which effects make them and where their coefficients stand."""
+    """Columns of one sensor: their effects and the positions of their coefficients."""
 
     effects: tuple
     """Effects that concern the sensor."""
     groups: dict
-    """Group name -> ColumnGroup, those that a warp makes left out."""
+    """Group name -> ColumnGroup, without the columns of warps."""
     rows: dict
     """Group name -> slice of the columns."""
     width: int
@@ -37,7 +37,7 @@ class SensorModel:
     """
     Effects of accelerometer, gyroscope and reference, with a fixed order of parameters.
 
-    `point` holds values of the effects whose columns depend on their own value (delays, lags, tilts, time constants).
+    `point` holds values of the effects with columns that depend on their own value (delays, lags, tilts, time constants).
     The columns are exact there; away from it they are the first derivative.
     """
 
@@ -48,15 +48,15 @@ class SensorModel:
     reference: tuple = ()
     """Names of the effects of table and clock."""
     joint_names: JointNames = JOINTS   # type: ignore[assignment]   # made one at once
-    """Joints of the table; a plain sequence of names is taken for turning joints of which no two neighbours are parallel."""
+    """Joints of the table; a plain sequence of names means turning joints without parallel neighbours."""
     temperature_ref_c: float = 25.0
     """Temperature at which thermal effects vanish, degrees Celsius."""
     point: dict = field(default_factory=dict)
     """Where the columns were linearised: effect name -> values."""
     folded_arms: np.ndarray | None = None
     """
-    Arms, shape (3, 3), for which the columns of a warp hold its change of the lever-arm terms too; None: that change has columns of its
-    own. Folded, the columns are fewer and exact at these arms only, as everything is exact at `point` only.
+    Arms, shape (3, 3), for which the columns of a warp include its change of the lever-arm terms; None: that change has separate
+    columns. Folded, the columns are fewer and exact at these arms only, as all columns are exact at `point` only.
     """
     catalogue: Catalogue = CATALOGUE
     """Where the effects are declared."""
@@ -67,7 +67,7 @@ class SensorModel:
         object.__setattr__(self, 'joint_names', JointNames.of(self.joint_names))
 
     def __reduce__(self):
-        """Travel to other processes without what was worked out: effects hold functions that cannot be sent."""
+        """Pickle without cached values: effects contain functions that cannot be pickled."""
         return SensorModel, tuple(getattr(self, f.name) for f in fields(self))
 
     @cached_property
@@ -109,7 +109,7 @@ class SensorModel:
 
     @property
     def definitions(self) -> dict[str, Any]:
-        """Plain data of those effects that somebody added to the catalogue, by name: what a document needs beside the names."""
+        """Plain data of the effects that were added to the catalogue, by name: a document needs them in addition to the names."""
         return self.catalogue.definitions({effect.name for effect in self.effects})
 
     @property
@@ -128,7 +128,7 @@ class SensorModel:
 
     @cached_property
     def requested(self) -> np.ndarray:
-        """Whether somebody asks for each parameter; table, clock and the common arm are nuisances. Shape (n_params,)."""
+        """Mask of the parameters of interest; table, clock and the common arm are nuisances. Shape (n_params,)."""
         return np.repeat([not e.nuisance for e in self.effects], [e.size for e in self.effects])
 
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
@@ -140,7 +140,7 @@ class SensorModel:
         return np.concatenate([self.point_of(effect) for effect in self.effects])
 
     def start_from(self, other: 'SensorModel', known: np.ndarray) -> np.ndarray:
-        """Return the values to start from, those of the effects of another model as they are known there."""
+        """Return the initial values; effects of another model have their values there."""
         values = self.start()
         for effect in other.effects:
             if effect.key in self.slices:
@@ -188,7 +188,7 @@ class SensorModel:
 
     def layout(self, sensor: str) -> ColumnLayout:
         """
-        Return where the coefficients of each group stand (worked out once per sensor).
+        Return the positions of the coefficients of each group (cached per sensor).
 
         Raises
         ------
@@ -225,7 +225,7 @@ class SensorModel:
         return self.layout(sensor).rows[effect.groups[0].name]
 
     def point_of(self, effect: Effect) -> np.ndarray:
-        """Return the values at which `effect`'s columns are taken: its prior's when nothing is known yet."""
+        """Return the values at which `effect`'s columns are linearised; default: its prior values."""
         known = self.point.get(effect.name)
         return effect.prior_values() if known is None else np.atleast_1d(np.asarray(known, float))
 
@@ -240,7 +240,7 @@ class SensorModel:
         return replace(self, point={**self.point, **moved})
 
     def full_point(self) -> dict[str, Any]:
-        """Return what the column groups need to know besides the reference."""
+        """Return the data of the column groups in addition to the reference."""
         settling = {e.name: self.point_of(e) for e in self.effects if e.time_constant}
         centre = {'centre': self.centre} if self.centre else {}
         return {**settling, **self.point, 'temperature_ref_c': self.temperature_ref_c, **centre}

@@ -1,4 +1,4 @@
-"""Effects made of plain data: a column as text, and what a person has to say of it. They travel in documents and to other processes."""
+"""Effects defined by plain data: a column as text, and its description. They are written to documents and sent to other processes."""
 
 import math
 from collections.abc import Sequence
@@ -10,18 +10,18 @@ from imu_calibration.effects.column_group import ColumnGroup
 from imu_calibration.errors import InputError
 
 JOINTS = {'joint angle', 'joint rate'}
-"""Quantities that only a table knows."""
+"""Quantities that exist only with a table."""
 MOTIONS = (('joint angle', ('static_dense', 'slow_turn')), ('joint rate', ('three_speeds',)),
            ('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('thermal branch', ('warm_and_cool',)),
            ('vibration', ('shake',)),
            ('temperature', ('warm_up',)), ('time', ('warm_up',)),
            ('rate', ('two_axis', 'three_speeds')), ('force', ('static_dense', 'centrifuge')))
-"""Standard motions that show a quantity; the first that a column uses is taken."""
+"""Standard motions that show a quantity; the first that a column uses applies."""
 DRAWN_AGAINST = {'joint angle': 'angle', 'joint rate': 'angle', 'temperature': 'temperature', 'thermal branch': 'temperature',
                  'time': 'time', 'force': 'force', 'rate': 'rate'}
-"""Quantity -> what a residual is drawn against where a column uses it; the first."""
+"""Quantity -> abscissa of the residual plot of a column that uses it; the first applies."""
 MANY = 100.0
-"""Tolerances in the prior's standard deviation, where nobody says more."""
+"""Tolerances in the default standard deviation of the prior."""
 
 
 def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tolerance: float, text: str,
@@ -30,7 +30,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
     """
     Return an effect ``output_i += value_i column``, with one value for each axis.
 
-    It is defined by this plain data alone, which `from_definition` reads again.
+    It is defined by this plain data only, which `from_definition` reads.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
     text : str
         One sentence that explains it.
     tolerance_reason : str
-        Where the tolerance comes from.
+        Source of the tolerance.
     prior_sd : float, optional
         Standard deviation of the prior about zero; a hundred tolerances.
     largest : float, optional
@@ -105,7 +105,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
 
 
 def _explanation(text, sensor, columns):
-    """Return the text as a sentence; what no text explains is said by its columns."""
+    """Return the text as a sentence; without text, a sentence with its columns."""
     text = text.strip() or f'The {sensor} output follows {", ".join(columns)}'
     return text if text.endswith(('.', '!', '?')) else f'{text}.'
 
@@ -117,7 +117,7 @@ def from_definition(name: str, definition: dict[str, Any]) -> Effect:
     Raises
     ------
     InputError
-        When something is missing, or there is something that does not belong there.
+        When something is missing, or a key is unknown.
 
     """
     try:

@@ -33,7 +33,7 @@ def _number(value):
 
 
 def main(folder: Path = Path(__file__).resolve().parents[2] / 'config') -> None:
-    """Write the file, and say whether it has changed."""
+    """Write the file, and report whether it has changed."""
     path = folder / 'tolerances.yaml'
     if not path.exists() or path.read_text() != rendered():
         path.write_text(rendered())
