@@ -1,4 +1,4 @@
-"""Which axis is which: the exchange of axes and signs that comes closest to a matrix between two frames."""
+"""Assignment of axes: the exchange of axes and signs that is closest to a matrix between two frames."""
 
 from dataclasses import dataclass
 from itertools import permutations, product
@@ -13,7 +13,7 @@ TIE = 0.05
 
 
 def signed_permutations() -> np.ndarray:
-    """Return the 48 matrices that exchange axes and signs, the identity first, then those with few changes; shape (48, 3, 3)."""
+    """Return the 48 matrices that exchange axes and signs, the identity first, then by number of changes; shape (48, 3, 3)."""
     found = [np.eye(3)[list(order)] * np.array(signs)[:, None] for order in permutations(range(3)) for signs in product((1.0, -1.0),
                                                                                                                         repeat=3)]
     return np.array(sorted(found, key=lambda matrix: (matrix != np.eye(3)).any(axis=1).sum()))
@@ -21,12 +21,12 @@ def signed_permutations() -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class AxisMatch:
-    """How measured axes lie to those of a reference."""
+    """Assignment of measured axes to the axes of a reference."""
 
     matrix: np.ndarray
-    """``measured = scale * matrix @ reference`` as closely as axes and signs can say, shape (3, 3)."""
+    """Closest signed permutation in ``measured = scale * matrix @ reference``, shape (3, 3)."""
     agreement: float
-    """1: as `matrix` says."""
+    """1: exactly as `matrix`."""
     as_they_are: float
     """1: every axis is that of the reference; -1: all turned round."""
     turned: bool
@@ -36,11 +36,11 @@ class AxisMatch:
 
     @property
     def wrong(self) -> bool:
-        """Return whether the axes are not those of the reference."""
+        """Return whether the axes differ from those of the reference."""
         return self.as_they_are < POOR
 
     def exchanges(self, seen: np.ndarray = np.eye(3)) -> list[tuple[int, int, float]]:
-        """Return (measured axis, reference axis, sign) of what is not as it should be, for the reference axes that were seen."""
+        """Return (measured axis, reference axis, sign) of each wrong axis, for the reference axes with motion."""
         found = []
         for j in np.flatnonzero(np.diag(seen) > 0.5):
             i = int(np.argmax(np.abs(self.matrix[:, j])))
@@ -56,7 +56,7 @@ def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:
     Parameters
     ----------
     matrix : array, shape (3, 3)
-        Up to a common positive factor; only ``matrix @ seen`` is looked at.
+        Up to a common positive factor; only ``matrix @ seen`` is used.
     seen : array, shape (3, 3)
         Projector on the directions in which the reference moved.
 

@@ -1,5 +1,5 @@
 """
-What is wrong with a recording before anything is estimated from it.
+Checks of a recording before the estimate.
 
 `CHECKS` is the registry: a check is a function of the `Evidence` that yields `Finding` objects; adding one is adding an entry.
 """
@@ -22,7 +22,7 @@ CHECKS = (
     value_checks.repeated_readings, value_checks.resolution, value_checks.temperature,
     stamp_checks.sampling, stamp_checks.gaps, stamp_checks.jitter,
 )
-"""In the order in which they refuse: a wrong unit makes much of what follows wrong as well."""
+"""In the order in which they refuse: a wrong unit causes failures of later checks as well."""
 
 
 class Preflight:
@@ -34,7 +34,7 @@ class Preflight:
     gravity : float, optional
         Local gravity, m/s^2; default standard gravity.
     strict : bool
-        Whether `finish` raises when a finding says that the result would be wrong.
+        Whether `finish` raises when a finding implies a wrong result.
 
     """
 
@@ -43,20 +43,20 @@ class Preflight:
         self.findings: tuple[CheckFinding, ...] = ()
         self.streams: dict[str, StreamStatistics] = {}
         self.lost: dict[str, int] = {}
-        """What was found; name -> StreamStatistics; reason -> messages that could not be read: all of them after `finish`."""
+        """Findings; name -> StreamStatistics; reason -> number of unreadable messages: complete after `finish`."""
 
     def push(self, cleaned: CleanedBlock) -> None:
-        """Take a CleanedBlock."""
+        """Process a CleanedBlock."""
         self._gatherer.push(cleaned)
 
     def finish(self, cleaner: BlockCleaner) -> None:
         """
-        Check what was seen of the streams that the BlockCleaner cleaned.
+        Check the streams that the BlockCleaner cleaned.
 
         Raises
         ------
         InputError
-            When a finding says that the result would be wrong, unless `strict` is off.
+            When a finding implies a wrong result, unless `strict` is off.
 
         """
         self.streams, self.lost = cleaner.statistics(), cleaner.lost

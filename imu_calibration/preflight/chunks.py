@@ -9,9 +9,9 @@ CHUNK_TIME = 0.25
 LEAST, MOST = 8, 2048
 """Samples per chunk."""
 FIRST = 200
-"""Samples that tell the period."""
+"""Samples from which the period is estimated."""
 CAPACITY = 40_000
-"""Chunks kept, nearly three hours; what comes later is counted but not looked at."""
+"""Chunks kept, nearly three hours; later samples are counted but not checked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class ChunkSeries:
         self._parts, self._n_chunks = [], 0
 
     def push(self, stamp_ns: np.ndarray, columns: np.ndarray) -> None:
-        """Take clean samples of one epoch of the clock: stamps, shape (n,), and force and rate, shape (6, n)."""
+        """Process clean samples of one epoch of the clock: stamps, shape (n,), and force and rate, shape (6, n)."""
         self._count_changes(columns)
         if self._rest is not None:
             stamp_ns, columns = np.concatenate([self._rest[0], stamp_ns]), np.concatenate([self._rest[1], columns], axis=1)
@@ -115,7 +115,7 @@ def _size(stamps, chunk_time):
 
 def _describe(time, values):
     start = values[:, :, :1].copy()
-    values = values - start   # counts far from zero would cancel
+    values = values - start   # avoids cancellation with large offsets
     mean = values.mean(axis=2)
     sd = np.sqrt(np.maximum(np.einsum('ijk,ijk->ij', values, values) / values.shape[2] - mean**2, 0.0))
     size = time.shape[1]

@@ -1,4 +1,4 @@
-"""What the checks look at, gathered in one pass over the blocks in bounded memory."""
+"""Input of the checks, gathered in one pass over the blocks in bounded memory."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +19,7 @@ from imu_calibration.segmentation.stream_cleaning import StreamStatistics
 IRREGULAR = 0.1
 """Steps farther than this share from the usual one count as irregular."""
 RESOLUTION_SAMPLES = 20_000
-"""First samples, in which the smallest step between readings is looked for."""
+"""First samples, from which the smallest step between readings is estimated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Stream:
 
     @property
     def real_rate(self) -> float:
-        """Samples per second of the time that no gap takes, 0 when unknown."""
+        """Samples per second, gaps excluded; 0 when unknown."""
         s = self.statistics
         time = s.duration - s.gap_total + s.n_gaps * s.period
         return (s.count - 1) / time if s.count > 1 and time > 0 else 0.0
@@ -48,15 +48,15 @@ class RecordingEvidence:
     """A recording as the checks see it, cleaned and in SI."""
 
     streams: dict
-    """'imu', 'joints', 'temperature' -> Stream; only those that came."""
+    """'imu', 'joints', 'temperature' -> Stream; only streams with messages."""
     chunks: Chunks
     """Readings of the IMU in short chunks."""
     n_samples: int
-    """IMU samples that were looked at."""
+    """IMU samples that were checked."""
     n_changed: np.ndarray
     """How often each of force x, y, z, rate x, y, z differs from the sample before, shape (6,)."""
     n_repeated: int
-    """Samples whose readings are all those of the sample before."""
+    """Samples with all readings equal to those of the previous sample."""
     resolution: np.ndarray
     """Smallest step between readings of each column, shape (6,); 0 when unknown."""
     ends: tuple
@@ -86,7 +86,7 @@ class RecordingEvidence:
 
     @cached_property
     def rest(self) -> Rest | None:
-        """What was read while steady, or None."""
+        """Readings while steady, or None."""
         return find_rest(self.awake)
 
     @cached_property
@@ -96,7 +96,7 @@ class RecordingEvidence:
 
     @cached_property
     def rate_factor(self) -> float | None:
-        """Measured rates over those that carry gravity from rest to rest, or None."""
+        """Ratio of measured rates to the rates that turn gravity from rest to rest, or None."""
         return factor_between_rests(self.awake, self.rest)
 
     @cached_property
@@ -115,7 +115,7 @@ class RecordingEvidence:
 
 
 class EvidenceGatherer:
-    """Takes cleaned blocks and gives the `RecordingEvidence`."""
+    """Computes the `RecordingEvidence` from cleaned blocks."""
 
     def __init__(self, gravity: float):
         self.gravity = gravity
@@ -125,7 +125,7 @@ class EvidenceGatherer:
         self._temperature_c: tuple[float, float] | None = None
 
     def push(self, cleaned: CleanedBlock) -> None:
-        """Take a CleanedBlock."""
+        """Process a CleanedBlock."""
         for name in STREAMS:
             for epoch, samples in getattr(cleaned, name):
                 self._steps[name].push(samples.stamp_ns, epoch)
@@ -166,7 +166,7 @@ class _Steps:
         self._epoch, self._n_steps, self._n_irregular = 0, 0, 0
 
     def push(self, stamp_ns, epoch):
-        """Take accepted stamps of one epoch."""
+        """Process accepted stamps of one epoch."""
         if self.first_ns is None:
             self.first_ns, self.last_ns = int(stamp_ns[0]), int(stamp_ns[0])
         self.first_ns, self.last_ns = min(self.first_ns, int(stamp_ns[0])), max(self.last_ns, int(stamp_ns[-1]))

@@ -34,7 +34,7 @@ class Exchange(NamedTuple):
     axes: tuple[str, ...]
     """One phrase per IMU axis to correct, in addition."""
     instead: tuple[str, ...]
-    """One phrase per IMU axis whose correction explains the rates and the specific force equally well, without the joints."""
+    """One phrase per IMU axis; with these corrections and unchanged joints, rates and specific force are explained equally well."""
     share: float
     """Share of the rates that it explains, ``1 - sum |measured - reference|^2 / sum |measured|^2``."""
     span: tuple[float, float] | None
@@ -98,7 +98,7 @@ def _best(measured, motion, table):
 
 
 def _candidates(n_joints):
-    """Return (joint whose readings each joint needs, signs) of the candidates, the description itself first."""
+    """Return (index of the joint with the readings of each joint, signs) of the candidates, the description itself first."""
     identity, plus = list(range(n_joints)), [1.0] * n_joints
     if n_joints <= MOST_JOINTS:
         return [(list(order), list(signs)) for order in permutations(identity) for signs in product((1.0, -1.0), repeat=n_joints)]

@@ -5,11 +5,11 @@ import numpy as np
 KEPT = 24
 """Different outputs below the largest that are counted."""
 NEAR = 0.9
-"""Outputs above this share of the largest are looked at."""
+"""Outputs above this share of the largest are evaluated."""
 CANDIDATES = 400
 LEAST_CLIPPED = 4
 JUMP = 0.01
-"""A reading that comes from farther below the largest than this share of it did not get there by noise."""
+"""A step to the largest value by more than this share of it is not noise."""
 PILE = 5.0
 """A pile has this many times the samples of the outputs just below it."""
 
@@ -22,7 +22,7 @@ class Extremes:
         self._below, self._last = {}, np.inf
 
     def push(self, values: np.ndarray) -> None:
-        """Take values, shape (n,)."""
+        """Process values, shape (n,)."""
         before, self._last = self._last, values[-1]
         largest = values.max()
         if largest <= 0 or largest < NEAR * self.level:
@@ -46,12 +46,12 @@ class Extremes:
 
     @property
     def jumped(self) -> bool:
-        """Whether the pile was entered from far below time and again, as no rounded reading of a constant does."""
+        """Whether the largest value was often reached by a large step, which does not occur with rounded readings of a constant."""
         return self.n_jumps >= LEAST_CLIPPED
 
     @property
     def n_clipped(self) -> int:
-        """Samples at the largest value when they are a pile, else 0."""
+        """Samples at the largest value if their number is far above that of neighbouring values, else 0."""
         counts = [count for value, count in self._below.items() if value > NEAR * self.level][:10]
         usual = sum(counts) / len(counts) if counts else 1.0
         return self.count if self.count >= max(LEAST_CLIPPED, PILE * usual) else 0

@@ -1,4 +1,4 @@
-"""What a check says about a recording."""
+"""The result of a check of a recording."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -29,16 +29,16 @@ class CheckFinding:
     severity: Severity
     """How much it matters."""
     text: str
-    """What must hold, what came, what to do; for GOOD what was seen."""
+    """Requirement, received value and remedy; for GOOD, the observation."""
     samples: int = 0
     """Samples that are unusable because of it and that no other count holds."""
     key: str | None = None
-    """What has to be given, a key of `errors.KEYS`."""
+    """The missing input, a key of `errors.KEYS`."""
 
     def named(self, name: str) -> 'CheckFinding':
         """Return the finding with the name of its recording before the text."""
         return replace(self, text=f'{name}: {self.text}')
 
     def to_mapping(self) -> dict:
-        """Return what stands in the calibration file."""
+        """Return the entry for the calibration file."""
         return {'check': self.check, 'severity': self.severity, 'text': self.text, 'samples': self.samples}

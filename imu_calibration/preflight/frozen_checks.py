@@ -1,4 +1,4 @@
-"""Checks of outputs that stand still: an axis, a sensor, or the joints, for a time or throughout."""
+"""Checks of frozen outputs: an axis, a sensor, or the joints, for a time or throughout."""
 
 from collections.abc import Iterator
 
@@ -9,11 +9,11 @@ from imu_calibration.preflight.finding import REFUSE, WARNING, CheckFinding
 from imu_calibration.preflight.frozen_parts import SENSOR_COLUMNS, long_runs
 
 MOVING = 50.0
-"""An axis beside one that moves by this many steps of the converter does not stay the same by chance."""
+"""A constant axis is frozen if another axis moves by this many steps of the converter."""
 
 
 def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
-    """No output stands still while its neighbours move."""
+    """No output is constant while other axes move."""
     chunks, range_ = evidence.chunks, evidence.chunks.range
     if not len(chunks):
         return
@@ -42,7 +42,7 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 
 def _at_end(values, ends):
-    """Return which values are those at which an output piles up: clipped, not frozen."""
+    """Return which values are clipping limits of an output: clipped, not frozen."""
     return np.logical_or.reduce([np.isclose(values, sign * end.level, rtol=1e-9) & (end.n_clipped > 0) for sign, end in zip((1, -1), ends)])
 
 
@@ -54,7 +54,7 @@ def _in_long_runs(flags):
 
 
 def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
-    """Every sensor and every joint goes on measuring to the end."""
+    """Every sensor and every joint measures until the end."""
     parts = evidence.frozen_parts
     spans = {}
     for part in parts:

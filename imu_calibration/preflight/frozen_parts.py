@@ -1,4 +1,4 @@
-"""Where a sensor gives one reading again and again although it has noise, and where joints stand still while the IMU turns."""
+"""Stretches in which a sensor with noise repeats one reading, or in which all joint positions are constant while the IMU turns."""
 
 from dataclasses import dataclass
 
@@ -12,14 +12,14 @@ SENSOR_COLUMNS = {'accelerometer': slice(0, 3), 'gyroscope': slice(3, 6)}
 LONG = 4
 """Chunks, one second."""
 STEPS = 2.0
-"""Noise at rest that spans this many steps of the converter in a chunk does not vanish on three axes for a second by chance."""
+"""A sensor with a noise at rest of at least this many converter steps in a chunk is not constant on three axes for a second."""
 TURNS = 0.1
 """Mean rate of a chunk from which on the IMU turns, rad/s."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrozenPart:
-    """One stretch in which nothing new was read."""
+    """One stretch without new readings."""
 
     who: str
     """'accelerometer', 'gyroscope' or 'joints'."""
@@ -41,8 +41,8 @@ def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarra
     """
     Return sensor -> which chunks it is frozen in, bool, shape (n,).
 
-    A sensor whose noise shows at rest elsewhere never gives one reading on three axes for a second. One that is coarser than its noise,
-    or has none, does so at every rest: then the constant stretches outnumber those at rest with noise, and nothing is said.
+    A sensor with visible noise at rest never repeats one reading on three axes for a second. A sensor with steps coarser than its noise,
+    or without noise, does so at every rest: the constant stretches then outnumber the rests with noise, and none is reported.
 
     Parameters
     ----------
@@ -76,16 +76,16 @@ def frozen_parts(chunks: Chunks, frozen: dict[str, np.ndarray]) -> list[FrozenPa
 
 def frozen_joints(chunks: Chunks, still_ns: np.ndarray, rate_at_rest: np.ndarray) -> list[FrozenPart]:
     """
-    Return where all joints stand still for a second while the IMU turns.
+    Return the stretches in which all joint positions are constant for a second while the IMU turns.
 
     Parameters
     ----------
     chunks : Chunks
-        Without those in which the gyroscope is frozen.
+        Without chunks in which the gyroscope is frozen.
     still_ns : array, shape (n, 2)
         First and last stamp of each stretch in which no joint position changes.
     rate_at_rest : array, shape (3,)
-        What the gyroscope reads at rest, rad/s; what it reads mostly while the joints stand still, where that explains more (spins about
+        Reading of the gyroscope at rest, rad/s; its most frequent reading with constant joints if that explains more (spins about
         the vertical are as steady as rests).
 
     """
@@ -118,7 +118,7 @@ class StandingJoints:
         self._since, self._until = 0, 0
 
     def push(self, stamp_ns: np.ndarray, position: np.ndarray) -> None:
-        """Take joint samples in order: stamps, shape (n,), and positions, shape (n, n_joints)."""
+        """Process joint samples in order: stamps, shape (n,), and positions, shape (n, n_joints)."""
         if self._last is not None and len(self._last) != position.shape[1]:
             self._close()
             self._last = None

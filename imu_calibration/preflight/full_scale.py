@@ -10,19 +10,19 @@ from imu_calibration.preflight.rest import Rest
 
 FAR = 0.25
 """
-Rms angle by which gravity misses the direction after a turn, rad, from which on factors are tried at all: scales off by a tenth leave less.
+Rms angle by which gravity misses the direction after a turn, rad, above which factors are tested: scale errors of a tenth cause less.
 """
 BETTER = 0.3
-"""A factor is believed when it leaves less than this share of that angle."""
+"""A factor is accepted when the remaining angle is below this share of the angle without it."""
 FACTORS = 2.0 ** np.arange(-4.0, 4.01, 0.25)
 """
-Readings over true rates that are tried: full-scale ranges from a sixteenth to sixteen times the one that is set, and what lies between.
+Tested ratios of readings to true rates: full-scale ranges from a sixteenth to sixteen times the set range, and intermediate values.
 """
 NEAR_POWER = 0.15
 """A factor within this share of a power of two is one: scales are off by a few per cent."""
 LEAST_TURNS, MOST_TURNS = 3, 16
 LEAST_ANGLE = 0.3
-"""Turns of gravity below it say little of factors, rad."""
+"""Least turn of gravity for a test of factors, rad."""
 LONGEST = 30.0
 """s; the gyroscope's wander adds up in longer turns."""
 

@@ -16,17 +16,17 @@ from imu_calibration.preflight.value_checks import force_error
 from imu_calibration.reference.table import Table
 
 SEEN = {'accelerometer': 0.03, 'gyroscope': 0.01}
-"""Directions in which the reference has less than this share of its largest power say nothing."""
+"""Directions in which the reference has less than this share of its largest power are not used."""
 RELATED = 0.5
-"""Smallest squared correlation from which on factors and axes are looked at."""
+"""Smallest squared correlation for a check of factors and axes."""
 LEAST_RATE = 0.02
-"""Rms of the reference's rates below which they say nothing, rad/s."""
+"""Least rms of the reference's rates for a check, rad/s."""
 WORDS = {'accelerometer': ('specific force at rest', 'gravity in the attitudes of the joints'),
          'gyroscope': ('angular rates', 'the rates of the joints')}
 
 
 class Reduced(Protocol):
-    """What a recording was reduced to: `calibration.gathered.Gathered`."""
+    """Reduced data of a recording: `calibration.gathered.Gathered`."""
 
     @property
     def accumulator(self) -> Any:
@@ -34,12 +34,12 @@ class Reduced(Protocol):
 
     @property
     def moving(self) -> list:
-        """Moving windows with their samples, as far as they are kept."""
+        """Moving windows with kept samples."""
 
 
 def against_joints(gathered: Reduced, model: SensorModel, table: Table | None = None) -> tuple[CheckFinding, ...]:
     """
-    Return the findings about measured rates and forces beside those that the joints imply.
+    Return the findings of a comparison of measured rates and forces with those implied by the joints.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def _axes(sensor, moments, table, windows):
     seen, inverse = _seen(sensor, reference)
     matrix = cross @ inverse
     if np.trace(matrix @ reference @ matrix.T) < RELATED * np.trace(measured):
-        return   # something else rules the readings, and other checks say what
+        return   # a different fault dominates the readings and is reported by other checks
     match = match_axes(matrix, seen)
     if not match.wrong:
         return
@@ -159,7 +159,7 @@ def _cause(match, matrix, seen, table):
 
 
 def _mount_rpy_deg(matrix, table):
-    """Return roll, pitch, yaw of the rotation nearest to what was measured, as `mount.rpy_deg` gives them."""
+    """Return roll, pitch, yaw of the rotation nearest to the measured matrix, in the convention of `mount.rpy_deg`."""
     left, _, right = np.linalg.svd(matrix)
     mat_ls = (left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right @ table.mat_sl).T
     pitch = np.arctan2(-mat_ls[2, 0], np.hypot(mat_ls[2, 1], mat_ls[2, 2]))
@@ -170,14 +170,14 @@ def _mount_rpy_deg(matrix, table):
 
 def check_units(gathered: Reduced, model: SensorModel, table: Table | None = None) -> None:
     """
-    Refuse recordings whose units are plainly not SI, or whose axes are not those of the table.
+    Refuse recordings with units other than SI, or with axes other than those of the table.
 
-    Compares the length of the specific force at rest with gravity, and rates and forces with those that the joints imply.
+    Compares the length of the specific force at rest with gravity, and rates and forces with the values implied by the joints.
 
     Raises
     ------
     InputError
-        Naming the likely unit, or how the axes lie.
+        With the likely unit, or the assignment of the axes.
 
     """
     rows = gathered.accumulator.rows

@@ -1,4 +1,4 @@
-"""Checks of what stands in messages beside the readings: frame, covariances, orientation, and how old the stamps are when messages come."""
+"""Checks of the other fields of messages: frame, covariances, orientation, and age of the stamps at arrival."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -8,17 +8,17 @@ import numpy as np
 from imu_calibration.preflight.finding import GOOD, NOTE, WARNING, CheckFinding
 
 OLD = 0.5
-"""s; transforms and filters drop what is older, and a driver's own delay is far below it."""
+"""s; transforms and filters drop older messages, and the delay of a driver is much smaller."""
 ABSENT = -1.0
 """First element of a covariance: the message does not have that quantity (sensor_msgs/Imu)."""
 QUANTITIES = ('specific force', 'angular rate', 'orientation')
 SYMMETRY = 1e-6
-"""Share of the largest variance; rounding is far below it."""
+"""Share of the largest variance; rounding errors are much smaller."""
 
 
 @dataclass(frozen=True, eq=False)
 class MessageEvidence:
-    """What the messages of one topic carry beside their readings."""
+    """Contents of the messages of one topic other than readings."""
 
     frame_ids: dict[str, int] = field(default_factory=dict)
     """frame_id -> messages."""
@@ -31,7 +31,7 @@ class MessageEvidence:
 
 
 def check_messages(evidence: MessageEvidence) -> tuple[CheckFinding, ...]:
-    """Return what is found in `MessageEvidence`, nothing when no message came."""
+    """Return the findings in `MessageEvidence`; empty without messages."""
     if not evidence.frame_ids:
         return ()
     return tuple(finding for check in (frame, covariance, orientation, age) for finding in check(evidence))
@@ -76,7 +76,7 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
 
 
 def orientation(evidence: MessageEvidence) -> Iterator[CheckFinding]:
-    """An orientation is a unit quaternion, or said to be absent."""
+    """An orientation is a unit quaternion, or marked as absent."""
     given = evidence.covariances.get('orientation')
     if evidence.orientation is None or given is None or given[0, 0] == ABSENT:
         return
@@ -90,7 +90,7 @@ def orientation(evidence: MessageEvidence) -> Iterator[CheckFinding]:
 
 
 def age(evidence: MessageEvidence) -> Iterator[CheckFinding]:
-    """Stamps are those of this computer's clock, or near it."""
+    """Stamps are close to this computer's clock."""
     if not len(evidence.age):
         return
     median = float(np.median(evidence.age))

@@ -13,7 +13,7 @@ from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 
 TURNS = 0.05
-"""Smallest gain of the measured rates with respect to those of the table for an IMU on the table."""
+"""Smallest gain of the measured rates with respect to the rates of the table for an IMU on the table."""
 LARGEST_SHIFT = 5.0
 """Largest delay between the streams that is tested, s."""
 LEAST_SHIFT = 0.05
@@ -189,7 +189,7 @@ def _correlations(first, second, most):
 
 
 def _nearest_peak(shares, middle):
-    """Return the index of the peak nearest to no delay among those within ALIKE of the highest: periodic motion has many."""
+    """Return the index of the peak nearest to zero delay among peaks within ALIKE of the highest: periodic motion has many."""
     inner = shares[1:-1]
     peaks = 1 + np.flatnonzero((inner >= shares[:-2]) & (inner >= shares[2:]) & (inner >= shares.max() - ALIKE))
     return int(peaks[np.argmin(np.abs(peaks - middle))]) if len(peaks) else int(np.argmax(shares))

@@ -1,4 +1,4 @@
-"""Where the sensor was at rest, whatever its units, and what it read there."""
+"""Rests of the sensor, independent of its units, and its readings there."""
 
 from dataclasses import dataclass
 
@@ -17,12 +17,12 @@ LEAST_FACES = 6
 FARTHEST = 0.8
 """Bias in units of gravity from which on readings are no sphere but counts with an offset."""
 LEAST_SPREAD = 0.05
-"""Smallest eigenvalue of the scatter of directions (1/3 when they are even) from which on poses tell bias from length."""
+"""Smallest eigenvalue of the scatter of directions (1/3 when they are even) above which poses separate bias from length."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """What was read while steady: at rest, or turning so that gravity keeps its direction."""
+    """Readings while steady: at rest, or in a rotation with constant direction of gravity."""
 
     force: np.ndarray
     """Mean specific force in each steady stretch, shape (n_stretches, 3)."""
@@ -62,7 +62,7 @@ class Rest:
 
     @property
     def length(self) -> float:
-        """Gravity as the accelerometer reads it: the radius of the sphere, else the median length."""
+        """Gravity in the units of the accelerometer: the radius of the sphere, else the median length."""
         return float(np.median(self.norm)) if self.sphere is None else self.sphere[1]
 
 

@@ -1,4 +1,4 @@
-"""Checks of the stamps: what was dropped, gaps, rates, clocks."""
+"""Checks of the stamps: dropped samples, gaps, rates, clocks."""
 
 from collections.abc import Iterator
 
@@ -18,7 +18,7 @@ ADVICE = {
     'clock reset': 'the clock was set while recording; the parts are processed separately',
 }
 SPIKE_SHARE = 5e-3
-"""A knock now and then looks like one, and one per cent of them costs a calibration nothing; this many have a cause."""
+"""Occasional knocks resemble spikes, and 1 % of spikes do not degrade a calibration; a larger share has a cause."""
 GAP_SHARE = 0.01
 RATE_SHARE = 0.02
 IRREGULAR_SHARE = 0.05
@@ -60,7 +60,7 @@ def _times(count):
 
 
 def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
-    """Nothing is missing within the streams."""
+    """The streams have no gaps."""
     for name in FAST:
         if name in evidence.streams:
             found = evidence.streams[name].statistics
@@ -73,7 +73,7 @@ def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 
 def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
-    """The samples per second are those that the step between stamps promises."""
+    """The samples per second agree with the step between stamps."""
     for name in FAST:
         if name in evidence.streams:
             stream = evidence.streams[name]

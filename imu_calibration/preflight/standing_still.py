@@ -1,4 +1,4 @@
-"""What stands still while everything else turns: a gyroscope that repeats one reading, one joint of several whose state does not follow."""
+"""Frozen parts during motion: a gyroscope that repeats one reading, or one of several joints with a constant state."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -12,20 +12,20 @@ from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 
 LASTING = 1.0
-"""Shorter standstills are left to others, s."""
+"""Least duration of a standstill, s; shorter ones are handled by other checks."""
 STILL = 1e-6
-"""A joint whose state repeats turns less than this once positions are smoothed, rad/s."""
+"""Largest rate of a joint with a repeated state after smoothing of the positions, rad/s."""
 ALONG = 0.8
 """Share of the unexplained rate that lies along the axis of a joint that is frozen, as a mean square."""
 OWN = 0.3
-"""The unexplained rate along that axis is at least this share of what is measured along it: a wrong gain leaves less."""
+"""The unexplained rate along that axis is at least this share of the measured rate along it: a wrong gain causes less."""
 
 
 def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | None:
     """
-    Return which part stands still for a second or more while the others turn, or None.
+    Return the part that is frozen for a second or more while the remaining parts turn, or None.
 
-    A joint is frozen when its state does not change while the gyroscope feels a rate about its axis that the other joints do not explain.
+    A joint is frozen when its state is constant while the gyroscope measures a rate about its axis that the other joints do not explain.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
 
 
 def _frozen(window, table, told, *, joint):
-    """Yield (start, stop) in which a joint's state stands still while the rest of the rate lies along its axis."""
+    """Yield (start, stop) in which a joint's state is constant while the residual rate is along its axis."""
     for start, stop in _runs(np.abs(window.motion.rate[:, joint]) < STILL):
         if window.time[stop - 1] - window.time[start] < LASTING:
             continue
@@ -83,7 +83,7 @@ def _runs(flags):
 
 
 def _joined(spans):
-    """Return spans in order, those that follow one another within a second in one."""
+    """Return spans in order, merged where the gap is below a second."""
     joined: list[tuple[float, float]] = []
     for start, stop in sorted(spans):
         if joined and start - joined[-1][1] < LASTING:

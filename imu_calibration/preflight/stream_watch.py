@@ -1,4 +1,4 @@
-"""How the streams of a live session are doing, by header stamps: rates, silence, what is being dropped."""
+"""State of the streams of a live session from header stamps: rates, silence, dropped samples."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -22,9 +22,9 @@ class StreamHealth(StrEnum):
 
     GOOD = 'good'
     TROUBLE = 'trouble'
-    """Something is lost, late or apart."""
+    """Messages are lost or late, or stamps differ between streams."""
     SILENT = 'silent'
-    """Nothing comes."""
+    """No messages arrive."""
 
 
 GOOD, TROUBLE, SILENT = StreamHealth
@@ -37,22 +37,22 @@ class StreamState:
     word: StreamHealth
     """How they are."""
     message: str
-    """One line: what is wrong and what to do."""
+    """One line: the fault and the remedy."""
     values: dict
     """Figures by name."""
     silent: tuple = ()
-    """Streams that are needed and do not come: 'imu', 'joints', 'temperature'."""
+    """Needed streams without messages: 'imu', 'joints', 'temperature'."""
     coming: tuple = ()
-    """Streams that come."""
+    """Streams with messages."""
     unusable: dict = field(default_factory=dict)
-    """Why nothing of a silent stream can be used although messages come: stream -> what was dropped."""
+    """Why the messages of a silent stream are unusable: stream -> dropped samples."""
     stamping: StampLine | None = None
     """How the stamps of the IMU are; None while that is not known."""
 
 
 class StreamWatch:
     """
-    Takes note of every block and says how the streams are.
+    Records every block and reports the state of the streams.
 
     Parameters
     ----------
@@ -78,16 +78,16 @@ class StreamWatch:
 
     @property
     def last_arrival(self) -> float | None:
-        """When the last message came, s of the clock given to `note`; None before the first."""
+        """Arrival time of the last message, s of the clock given to `note`; None before the first."""
         return max(self._arrived.values(), default=None)
 
     @property
     def n_imu(self) -> int:
-        """Imu samples so far."""
+        """Number of IMU samples."""
         return self._count['imu']
 
     def note(self, block: SampleBlock, now: float) -> None:
-        """Take a SampleBlock that arrived at `now`, s of a steady clock."""
+        """Process a SampleBlock that arrived at `now`, s of a steady clock."""
         for reason, count in (block.notes or {}).items():
             self._notes[reason], self._unstamped_at = self._notes.get(reason, 0) + count, now
         for name in self._count:
@@ -101,7 +101,7 @@ class StreamWatch:
             self._newest[name], self._arrived[name] = last, now
 
     def note_counts(self, counts: dict[str, int], now: float) -> None:
-        """Take the counts of what became of the samples."""
+        """Record the counts of samples by their use."""
         lost = dropped(counts)
         grown = {reason: count - self._lost.get(reason, 0) for reason, count in lost.items() if count > self._lost.get(reason, 0)}
         if grown:
@@ -109,11 +109,11 @@ class StreamWatch:
         self._lost = lost
 
     def note_stamping(self, line: StampLine | None) -> None:
-        """Take how the stamps of the IMU are (a StampLine), or None."""
+        """Record the state of the IMU stamps (a StampLine), or None."""
         self._stamping = line
 
     def _apart_for(self, lead, now):
-        """Return for how long the stamps of the streams have been apart, s; a fast replay sets them apart for moments."""
+        """Return the time for which the stamps of the streams have differed, s; in a fast replay they differ briefly."""
         if abs(lead) <= SILENT_AFTER:
             self._apart_since = None
             return 0.0
@@ -133,13 +133,13 @@ class StreamWatch:
         return StreamState(word, text, values, silent, coming, {name: what for name, what in unusable.items() if what}, self._stamping)
 
     def _recently(self, now, beginning=''):
-        """Return what was dropped lately, of the reasons with that beginning; '' for nothing."""
+        """Return the recently dropped samples for reasons with that beginning; '' if none."""
         if self._lost_at is None or now - self._lost_at >= RECENT:
             return ''
         return ', '.join(f'{count} {reason}' for reason, count in self._recent.items() if reason.startswith(beginning))
 
     def _word(self, silent, now):
-        """Return the word and the line that say how the streams are."""
+        """Return the state of the streams and the line that describes it."""
         if silent:
             none = len(silent) == len(self._needed)
             return SILENT if none else TROUBLE, f'no {" and no ".join(MESSAGES[name] for name in silent)} messages received' + (

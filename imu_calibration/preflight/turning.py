@@ -1,4 +1,4 @@
-"""Gravity as seen by the accelerometer turns as the gyroscope says: unit and axes of one against the other, without any table."""
+"""Rotation of measured gravity against measured rates: unit and axes of one sensor against the other, without a table."""
 
 from dataclasses import dataclass
 
@@ -10,19 +10,19 @@ from imu_calibration.reference.reference_motion import skew
 LARGEST_TURN = 0.7
 """Turns of gravity from chunk to chunk above it are left out, rad."""
 FORCE_BAND = 0.2
-"""Chunks whose specific force is off the usual length, or scatters, by more than this share are left out: they accelerate."""
+"""Chunks in which the specific force differs from the usual length, or scatters, by more than this share are excluded as accelerated."""
 LEAST_TURN = 1.0
 """Gravity must turn by this much altogether, rad."""
 LEAST_EXPLAINED = 0.5
 WIDTH = 4.0
-"""Errors of neighbouring chunks go together: standard deviations are this much larger than for independent ones."""
+"""Factor on standard deviations for the correlation of errors of neighbouring chunks."""
 SURE = 0.15
-"""A direction counts when the standard deviation of what it does is below this share of its length."""
+"""A direction is determined when the standard deviation of its column is below this share of its length."""
 
 
 @dataclass(frozen=True, eq=False)
 class Turning:
-    """What relates measured rates to the turn of measured gravity."""
+    """Relation between measured rates and the rotation of measured gravity."""
 
     matrix: np.ndarray
     """
@@ -30,7 +30,7 @@ class Turning:
     """
     seen: np.ndarray
     """
-    Projector on the directions of the measured rate that were: a turn about (1, 1, 1) alone shows one direction and no axis, shape (3, 3).
+    Projector on the directions with measured rates, shape (3, 3): turns about only (1, 1, 1) determine one direction and no axis.
     """
     explained: float
     """Share of gravity's turns that it explains."""
@@ -42,7 +42,7 @@ class Turning:
 
     @property
     def everywhere(self) -> bool:
-        """Whether the rates took all directions."""
+        """Whether the rates covered all directions."""
         return round(np.trace(self.seen)) == 3
 
     @property
@@ -53,9 +53,9 @@ class Turning:
 
 def relate_turns(chunks: Chunks) -> Turning | None:
     """
-    Return the `Turning` of Chunks, or None when gravity turns too little, or otherwise than any rates explain.
+    Return the `Turning` of Chunks, or None when gravity turns too little or is not explained by the rates.
 
-    ``du/dt = u x (matrix @ rate + offset)`` for the direction u of specific force; nothing is assumed of units, axes or bias.
+    ``du/dt = u x (matrix @ rate + offset)`` for the direction u of specific force; no assumptions on units, axes or bias.
     """
     pairs = _pairs(chunks)
     if pairs is None:
@@ -73,7 +73,7 @@ def relate_turns(chunks: Chunks) -> Turning | None:
             return None
         if sure.all():
             return Turning(matrix / scale @ seen.T, seen @ seen.T, explained)
-        # What turns least may only be the leakage of another direction, and then spoils both.
+        # The direction with the smallest rates may be leakage of another direction, and then degrades both.
         kept = kept & (spread > spread[kept].min())
     return None
 

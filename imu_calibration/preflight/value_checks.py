@@ -18,7 +18,7 @@ GRAVITY_SHARE = 0.02
 LINEAR = 0.8
 """m/s^2; a shorter specific force at rest is noise and bias of an acceleration without gravity. Readings in g have at least 0.8."""
 FASTEST = 100.0
-"""rad/s, 5700 deg/s: hardly any gyroscope measures more."""
+"""rad/s, 5700 deg/s: above the range of nearly all gyroscopes."""
 FASTEST_DEG = 5000.0
 """Numbers above it are no deg/s either."""
 CLIP_FORCE = 1.15
@@ -28,9 +28,9 @@ FINE = 8.0
 CLIP_RATE = 10.0
 """Times the range of the noise."""
 LEAST_RANGE = 0.4
-"""rad/s, 23 deg/s: what stops below it has not reached the end of the range of a gyroscope that is turned."""
+"""rad/s, 23 deg/s: a largest rate below it is not the end of the range of a gyroscope."""
 MOST_BIAS = {'accelerometer': 0.25 * STANDARD_GRAVITY, 'gyroscope': 60 * DEG}
-"""m/s^2, rad/s: several times what the cheapest grades promise (0.1 g, 20 deg/s)."""
+"""m/s^2, rad/s: several times the specification of the cheapest grades (0.1 g, 20 deg/s)."""
 PLACE = 0.005
 """Share by which gravity differs between places: 9.78 to 9.83 m/s^2."""
 REPEATED_SHARE = 0.05
@@ -69,7 +69,7 @@ def _unit(check, text):
 
 
 def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
-    """Angular rate is in rad/s: gravity turns by what the rates add up to."""
+    """Angular rate is in rad/s: gravity turns by the integral of the rates."""
     turning = evidence.turning
     largest = max((end.level for pair in evidence.ends[3:] for end in pair), default=0.0)
     convert = 'convert them in the driver'
@@ -94,7 +94,7 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 
 def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
-    """The driver converts for the full-scale range that is set: gravity goes from rest to rest as the rates add up."""
+    """The driver converts for the set full-scale range: gravity turns from rest to rest by the integral of the rates."""
     factor = _full_scale(evidence)
     if factor is None:
         return
@@ -109,9 +109,9 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 
 def _full_scale(evidence):
-    """Return the factor by which the rates are wrong when it may be that of a full-scale range, else None."""
+    """Return the factor of the rates if a wrong full-scale range may explain it, else None."""
     factor, turning = evidence.rate_factor, evidence.turning
-    if factor is None and turning is not None:   # no rests to go by
+    if factor is None and turning is not None:   # no rests available
         factor = nearest_power(1.0 / turning.factor)
         factor = factor if np.log2(factor) % 1 == 0 else None
     return factor if factor is not None and factor != 1.0 and FACTORS[0] < factor < FACTORS[-1] else None
@@ -177,7 +177,7 @@ def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The biases are such as sensors have."""
     rest = evidence.rest
     if rest is None or rest.bias is None or not 3.0 < evidence.length < 30.0:
-        return   # in few attitudes a steady spin about the vertical looks like rest
+        return   # with few attitudes, a steady spin about the vertical is not distinguishable from rest
     found = {'accelerometer': rest.bias, 'gyroscope': rest.rate}
     for sensor, _, unit in CHANNELS:
         size = float(np.linalg.norm(found[sensor]))
