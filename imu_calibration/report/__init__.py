@@ -1,5 +1,5 @@
 """
-Pages that people look at.
+HTML reports.
 
 In: a `CalibrationResult` or a `Diagnosis`. Out: one self-contained HTML page each.
 Read `calibration_page` first.

@@ -1,4 +1,4 @@
-"""The error budget, drawn and in numbers: noise beside what the reference contributes."""
+"""The error budget as figure and numbers: contributions of the noise and of the reference."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ LOWEST = 1e-5
 
 
 def budget_section(result: CalibrationResult) -> dict[str, Any]:
-    """Return the figure, the rows (largest component of each effect) and what was assumed."""
+    """Return the figure, the rows (largest component of each effect) and the assumptions."""
     budget = result.error_budget()
     terms = {name: np.sqrt(np.maximum(variance, 0.0)) for name, variance in result.calibration.covariance_terms.items()
              if np.any(variance > 0)}

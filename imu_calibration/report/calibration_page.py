@@ -1,4 +1,4 @@
-"""The report of a calibration: the verdict first, then everything that supports it."""
+"""The report of a calibration: the verdict first, then the supporting evidence."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ from imu_calibration.report.worked_sample import worked_sample
 
 def calibration_report(result: CalibrationResult) -> str:
     """
-    Return the report of a calibration, on a table or by hand, as one HTML page that needs nothing else.
+    Return the report of a calibration, on a table or by hand, as one self-contained HTML page.
 
     The same input gives the same bytes.
 
@@ -44,7 +44,7 @@ def calibration_report(result: CalibrationResult) -> str:
 
 
 def tiles(result: CalibrationResult, errors: WindowErrors, navigation: dict[str, Any]) -> list[dict[str, str | None]]:
-    """Return the figures that matter most: what was determined, and the errors before and after."""
+    """Return the main figures: the determined parameters, and the errors before and after."""
     asked = list(result.calibration.requested.values())
     found = [_tile('parameters determined', f'{asked.count(DETERMINED)} of {len(asked)}', None, 'to their tolerances')]
     for sensor in SENSORS:

@@ -20,14 +20,14 @@ BINS = 16
 FEW = 200
 """Below this number of points the effect is drawn against its own prediction, with points that can be seen."""
 SPAN = {'windows': 'over 0.25 s', 'poses': 'of each pose'}
-"""What a point of a residual over time stands for."""
+"""Averaging span of a point of a residual over time."""
 CLEAR = 0.5
 """Share of the fitted effect that a single variable must explain for the effect to be drawn against it."""
 
 
 def diagnosis_report(result: DiagnosisResult) -> str:
     """
-    Return the report of a diagnosis as one HTML page that needs nothing else; the same input gives the same bytes.
+    Return the report of a diagnosis as one self-contained HTML page; the same input gives the same bytes.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def cause_of(diagnosis: Diagnosis, sensor: str, against: Sequence[str]) -> tuple
     traces = diagnosis.traces
     signal = traces.before[sensor] - traces.after[sensor]
     axis = int(np.argmax((signal**2).mean(axis=0)))
-    kinds = against if len(signal) >= FEW else ()   # bins of few poses have no useful means
+    kinds = against if len(signal) >= FEW else ()   # bins of few poses have uncertain means
     best = max(((explained_share(values, signal[:, axis]), label, values)
                 for label, (kind, values) in variables(traces, diagnosis.baseline.model.joint_names).items() if kind in kinds),
                default=(0.0, '', None), key=lambda entry: entry[0])
@@ -253,7 +253,7 @@ def _candidate(row):
 
 
 def chance(probability: float) -> str:
-    """Return a probability as text; what underflows is not nothing."""
+    """Return a probability as text; an underflow is not shown as zero."""
     return text(probability, 2) if probability > 1e-99 else 'below 10⁻⁹⁹'
 
 

@@ -1,4 +1,4 @@
-"""How every figure looks, and how it becomes SVG inside the page: no screen, no dates, the same input gives the same bytes."""
+"""Style of all figures and their output as SVG inside the page: no screen, no dates, the same input gives the same bytes."""
 
 import io
 import math
@@ -41,7 +41,7 @@ def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, 
     paint : callable
         ``paint(figure)`` draws on an empty matplotlib figure.
     label : str
-        What is seen, for those who cannot.
+        Text alternative of the figure.
 
     """
     import matplotlib
@@ -59,7 +59,7 @@ def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, 
 
 
 def _laid_out(figure):
-    """Place the axes once and return the canvas; `savefig` would do it twice more, and draw once for nothing."""
+    """Place the axes once and return the canvas; `savefig` would do it twice more, and draw once without need."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     canvas = FigureCanvasSVG(figure)
     figure.get_layout_engine().execute(figure)
@@ -68,7 +68,7 @@ def _laid_out(figure):
 
 
 def _inside(svg, label):
-    """Return the svg element alone: without prologue, metadata and the identifiers that repeat from figure to figure."""
+    """Return only the svg element: without prologue, metadata and the identifiers that repeat from figure to figure."""
     svg = svg[svg.index('<svg'):]
     svg = re.sub(r'<metadata>.*?</metadata>', '', svg, flags=re.S)
     svg = re.sub(r' id="[A-Za-z0-9.]+_[0-9]+"', '', svg)
@@ -79,7 +79,7 @@ def _inside(svg, label):
 
 
 def log_axis(axis: Any) -> None:
-    """Make an axis logarithmic with decades only, written as plain text (mathtext takes most of the time of a page)."""
+    """Make an axis logarithmic with decades only, written as plain text (mathtext uses most of the time of a page)."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
     axis.axes.set(**{f'{axis.axis_name}scale': 'log'})
     axis.set_major_locator(LogLocator(numticks=8))

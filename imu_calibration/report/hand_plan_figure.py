@@ -12,7 +12,7 @@ from imu_calibration.reference.rotations import align
 from imu_calibration.report.figures import AXIS, FAINT, GREY, INK, draw
 
 SIZE = np.array([1.0, 0.7, 0.3])
-"""Half edges of the box along x, y, z: no two alike, so that attitudes look different."""
+"""Half edges of the box along x, y, z: all different, so that attitudes are distinguishable."""
 VIEW = np.array([[-np.sqrt(0.5), np.sqrt(0.5), 0.0], [-0.35, -0.35, 0.87]])
 """From the level frame to the picture: seen from above one's shoulder."""
 COLUMNS, MOST = 6, 36

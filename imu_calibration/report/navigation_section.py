@@ -1,4 +1,4 @@
-"""What the errors become in navigation: dead reckoning from the windows of this recording, before and after calibration."""
+"""Effect of the errors in navigation: dead reckoning from the windows of this recording, before and after calibration."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""The plot that people expect of noise: Allan deviation against averaging time, with bands, the fitted model and the slopes."""
+"""The standard plot of noise: Allan deviation against averaging time, with bands, the fitted model and the slopes."""
 
 import numpy as np
 from scipy.special import chdtri
@@ -18,7 +18,7 @@ def draw_curve(result: NoiseIdentification, sensor: str) -> Drawn:
 
 
 class _Curves:
-    """Points with 95 % bands, the model's line, what the trends had added, and a slope for each process of the noisiest axis."""
+    """Points with 95 % bands, the model's line, the contribution of the trends, and a slope for each process of the noisiest axis."""
 
     def __init__(self, result, sensor):
         self.result, self.sensor = result, sensor
@@ -52,7 +52,7 @@ class _Curves:
         axes.plot(tau[left_out], measured[left_out], 'o', color='white', markersize=1.8, zorder=4)
 
     def _limits(self, first):
-        """Return the range of what was measured with some room; bands of single averages reach far beyond."""
+        """Return the range of the measured values with a margin; bands of single averages are much wider."""
         curve = self.result.record.curve
         shown = np.sqrt(np.concatenate([curve.variance[:, first:first + 3], curve.raw[:, first:first + 3]])) * self.factor
         return np.nanmin(shown[shown > 0]) / 2.5, np.nanmax(shown) * 2.0

@@ -1,4 +1,4 @@
-"""The report of an identification of noise: the figures first, then the curves and what follows from them."""
+"""The report of an identification of noise: the figures first, then the curves and derived values."""
 
 import numpy as np
 
@@ -13,11 +13,11 @@ from imu_calibration.report.numbers import text
 from imu_calibration.report.page import render
 
 RATES = (50.0, 100.0, 200.0, 400.0, 1000.0)
-"""Rates for which discrete figures are given beside that of the recording, Hz."""
+"""Rates for discrete figures in addition to the rate of the recording, Hz."""
 
 
 def noise_report(result: NoiseIdentification, figures: NoiseFigures, horizon: float = HORIZON) -> str:
-    """Return the report as one HTML page that needs nothing else; the same input gives the same bytes."""
+    """Return the report as one self-contained HTML page; the same input gives the same bytes."""
     found = summary.counts(figures)
     word = 'good' if not found[WEAK] and not found[HELD] else 'weak'
     headline = f'{found[DETERMINED]} of {sum(found.values())} figures determined'
@@ -36,7 +36,7 @@ def _facts(figures):
 
 
 def _tiles(figures, horizon):
-    """Return the numbers that most filters ask for."""
+    """Return the numbers that most filters need."""
     tiles = []
     for sensor, unit, walk_unit in (('accelerometer', 'm/s²/√Hz', 'm/s³/√Hz'), ('gyroscope', 'rad/s/√Hz', 'rad/s²/√Hz')):
         found = figures.densities(sensor, horizon)
@@ -81,6 +81,6 @@ def _runs(figures):
 
 
 def _shortest(figures):
-    """Return the axes whose shortest averaging times were not fitted."""
+    """Return the axes on which the shortest averaging times were not fitted."""
     return [{'name': f'{sensor} {letter}', 'from': text(axis.shortest)}
             for sensor in SENSORS for letter, axis in zip('xyz', figures.sensor(sensor)) if axis.shortest * figures.rate > 1.5]

@@ -6,7 +6,7 @@ from imu_calibration.units import for_people, significant, with_sd
 
 
 def text(value: float | None, digits: int = 3) -> str:
-    """Return a number with `digits` significant digits and a real minus sign; an en dash for what is not a number."""
+    """Return a number with `digits` significant digits and a real minus sign; an en dash for None and non-finite values."""
     if value is None or not np.isfinite(value):
         return '–'
     shown = significant(float(value), digits)

@@ -1,4 +1,4 @@
-"""What the recording determines: standard deviations against tolerances, singular values, weak directions, correlations."""
+"""Observability of the parameters: standard deviations against tolerances, singular values, weak directions, correlations."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Where the calibration comes from: recording, table, settings, what was used and what was dropped."""
+"""Origin of the calibration: recording, table, settings, used and dropped samples."""
 
 from functools import singledispatch
 from typing import Any
@@ -11,7 +11,7 @@ from imu_calibration.settings import describe
 
 
 def recording_facts(result: CalibrationResult) -> list[tuple[str, str]]:
-    """Return (what, value) of the recording, for the head of the page."""
+    """Return (item, value) of the recording, for the head of the page."""
     calibration, conditions = result.calibration, result.calibration.conditions
     bags = calibration.provenance.get('bags') or []
     facts = [('recording', ', '.join(bag['name'] for bag in bags) or 'not named'),
@@ -68,7 +68,7 @@ def _joint(joint):
 
 @singledispatch
 def table_rows(_result: CalibrationResult) -> list[tuple[str, ...]]:
-    """Return (what, value) of the table; nothing for a calibration without one."""
+    """Return (item, value) of the table; empty for a calibration without a table."""
     return []
 
 

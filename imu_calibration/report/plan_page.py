@@ -1,4 +1,4 @@
-"""The report of a plan: what it promises first, then the motion and how it comes to be."""
+"""The report of a plan: the predicted result first, then the motion and its derivation."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from imu_calibration.units import for_people
 
 SAYS = {MotionKind.POSE: 'rest', MotionKind.RETURN: 'return', MotionKind.SPIN: 'spin', MotionKind.SWING: 'swing',
         MotionKind.TOGETHER: 'joint turn', MotionKind.MOVE: 'move'}
-"""What is counted, in the singular."""
+"""Unit of the count, in the singular."""
 
 
 def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
-    """Return the report as one HTML page that needs nothing else; the same input gives the same bytes."""
+    """Return the report as one self-contained HTML page; the same input gives the same bytes."""
     count, bound = int(plan.wanted.sum()), plan.lower_bound_seconds
     met = int((plan.sd <= plan.tolerances * (1 + 1e-6))[plan.wanted].sum())
     tiles = [_tile('time', text(plan.seconds), 's', f'{len(plan.motions)} motions'),
@@ -40,7 +40,7 @@ def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
 
 
 def hand_plan_report(plan: HandPlan, model: SensorModel, provenance: dict[str, Any]) -> str:
-    """Return the report of a plan for hands, in words and pictures."""
+    """Return the report of a plan by hand, as text and pictures."""
     count, met = len(plan.param_names), len(plan.param_names) - len(plan.missing)
     rows = [{'until': f'{number}', 'kind': 'turn' if step.is_turn else 'pose', 'words': step.words}
             for number, step in enumerate(plan.steps, start=1)]
@@ -87,7 +87,7 @@ def _rows(plan):
 
 
 def _groups(model, places, sd, tolerances):
-    """Return for each effect what is predicted of its parameters, in units that people read."""
+    """Return the predicted standard deviations of the parameters of each effect, in common units."""
     groups = []
     for effect in model.effects:
         names = [name for name in effect.param_names() if name in places]

@@ -1,4 +1,4 @@
-"""The proof in numbers: errors on data that took no part, by sensor and by what the IMU does."""
+"""The proof in numbers: errors on held-out data, by sensor and regime."""
 
 from imu_calibration.calibration.decision import harmed
 from imu_calibration.calibration.document import Calibration

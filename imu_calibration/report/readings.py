@@ -10,7 +10,7 @@ from imu_calibration.papers.zhang2017 import axis_readings
 from imu_calibration.report.numbers import fixed, text
 
 LEVEL = 0.02
-"""Windows whose mean specific force differs from 1 g by more than this share turn through the vertical and have no reading at 1 g."""
+"""Windows with a mean specific force further than this share from 1 g turn through the vertical and have no reading at 1 g."""
 
 
 def reading_tables(result: CalibrationResult, errors: WindowErrors) -> list[list[dict[str, Any]]]:

@@ -1,4 +1,4 @@
-"""Residuals: windows before and after calibration beside the noise floor, their autocorrelation, chi-square, noise and wander."""
+"""Residuals: windows before and after calibration with the noise floor, their autocorrelation, chi-square, noise and wander."""
 
 from typing import Any
 
@@ -70,7 +70,7 @@ def autocorrelation(result: CalibrationResult) -> dict[str, tuple[np.ndarray, np
     """
     Return sensor -> (lags in s, autocorrelation (n_lags, 3), two-sided 95 % bound of white noise), from the kept moving windows.
 
-    Each window's residual is taken about its own mean; windows are weighted by their length.
+    The mean of each window is subtracted from its residual; windows are weighted by their length.
     """
     windows = [w for w in result.gathered.kept if len(w) >= 100]
     if not windows:

@@ -1,4 +1,4 @@
-"""Spectra of what stays unexplained, with the tones that stand out."""
+"""Spectra of the unexplained residual with its significant tones."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from imu_calibration.report.figures import AFTER, GREY, INK, draw
 
 
 def draw_tones(sensor: str, rest: Unexplained) -> str:
-    """Return the spectra in which tones stand out, as SVG; empty where there is none."""
+    """Return the spectra with significant tones, as SVG; empty if there are none."""
     if not rest.tones:
         return ''
     label = f'Spectrum of the unexplained residual of the {sensor}'

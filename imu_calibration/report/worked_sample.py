@@ -32,7 +32,7 @@ def worked_sample(result: CalibrationResult) -> dict[str, Any]:
 
 
 def further_effects(calibration: Calibration) -> list[str]:
-    """Return the effects beside bias, matrix and size effect that compensation takes out."""
+    """Return the effects other than bias, matrix and size effect that compensation removes."""
     return [effect.name for effect in invertible(calibration.model).further if effect.role is not Role.ARMS]
 
 
@@ -56,7 +56,7 @@ def _steps(result, sample, corrected):
 
 
 def _sample(result):
-    """Return the sample that is carried through: the fastest of the kept ones, else a pose."""
+    """Return the sample of the worked example: the fastest of the kept ones, else a pose."""
     kept = [window for window in result.gathered.kept if len(window.motion) == len(window.time)]
     if kept:
         return _moving_sample(result, kept)
