@@ -1,18 +1,18 @@
-"""A machine beside the table, in sessions of sensors whose biases follow vibration: now off, now in one gear or another."""
+"""A machine next to the table, for sensors with biases that depend on vibration: off, or in one of several gears."""
 
 import numpy as np
 
 LOUDEST = 0.25
-"""What is left of it in the band of each axis in its loudest gear, root mean square, m/s^2."""
+"""Its rms in the band of each axis in its loudest gear, m/s^2."""
 GEARS, HOLD = (0.0, 1.0, 0.5, 0.0, 0.75), 11.0
-"""How loud it is in its gears, one after the other, and how long it stays in each, s."""
+"""Sequence of relative amplitudes of its gears, and time in each gear, s."""
 ALIASED = 0.31
 """Frequency to which the sampling brings it, of the sample rate."""
 
 
 def hum_and_variance(time: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return what is left of the machine in the specific force, m/s^2, and its variance, (m/s^2)^2, each shape (n, 3).
+    Return the contribution of the machine to the specific force, m/s^2, and its variance, (m/s^2)^2, each shape (n, 3).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What may be wrong with a simulated IMU beyond its model, by the physics of each cause; nothing here knows the catalogue of effects."""
+"""Faults of a simulated IMU beyond its model, by the physics of each cause; independent of the catalogue of effects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from imu_calibration.errors import InputError
 
 
 class Felt(NamedTuple):
-    """What the housing feels, and what its sensing elements answer so far; all shape (n, 3)."""
+    """True motion of the housing, and the outputs of its sensing elements up to this cause; all shape (n, 3)."""
 
     true_force: np.ndarray
     """Specific force, m/s^2."""
@@ -28,7 +28,7 @@ Cause = Callable[[Felt], Felt]
 
 
 def _two_half_ranges(rng: np.random.Generator) -> Cause:
-    """Each gyroscope's electrodes have a gain of their own for either sense of the turn, 0.2 to 0.4 % apart."""
+    """Each gyroscope's electrodes have different gains for the two senses of rotation, by 0.2 to 0.4 %."""
     gap = rng.uniform(2e-3, 4e-3, 3) * rng.choice([-1, 1], 3)
 
     def answer(felt: Felt) -> Felt:
@@ -38,7 +38,7 @@ def _two_half_ranges(rng: np.random.Generator) -> Cause:
 
 
 def _unbalanced_mass(rng: np.random.Generator) -> Cause:
-    """The gyroscopes' masses hang beside their axes: specific force turns them, 20 to 60 deg/h per g."""
+    """The gyroscopes' masses are off their axes: specific force turns them, 20 to 60 deg/h per g."""
     per_force = rng.uniform(20.0, 60.0, (3, 3)) * rng.choice([-1, 1], (3, 3)) * DEG_H / STANDARD_GRAVITY
     return lambda felt: felt._replace(rate=felt.rate + felt.true_force @ per_force.T)
 
@@ -50,7 +50,7 @@ def _soft_spring(rng: np.random.Generator) -> Cause:
 
 
 def _gain_by_sense(rng: np.random.Generator) -> Cause:
-    """Each accelerometer's amplifier has a gain of its own for either sign, 0.05 to 0.1 % apart."""
+    """Each accelerometer's amplifier has different gains for the two signs, by 0.05 to 0.1 %."""
     gap = rng.uniform(5e-4, 1e-3, 3) * rng.choice([-1, 1], 3)
 
     def answer(felt: Felt) -> Felt:
@@ -67,12 +67,12 @@ def _narrow_range(rng: np.random.Generator) -> Cause:
 CAUSES: dict[str, Callable[[np.random.Generator], Cause]] = {
     'two_half_ranges': _two_half_ranges, 'unbalanced_mass': _unbalanced_mass, 'soft_spring': _soft_spring, 'gain_by_sense': _gain_by_sense,
     'narrow_range': _narrow_range}
-"""Name -> function of a generator that draws the size and returns what the cause does; `narrow_range` belongs last."""
+"""Name -> function of a generator that draws the size and returns the cause; `narrow_range` belongs last."""
 
 
 def hidden_causes(names: Sequence[str], seed: int, size: float = 1.0) -> list[Cause]:
     """
-    Return the causes of those names, each drawn from a generator of its own, `size` times as large as drawn.
+    Return the causes of those names, each drawn from a separate generator, `size` times as large as drawn.
 
     Raises
     ------

@@ -14,7 +14,7 @@ from imu_calibration.reference.trajectory_points import TrajectoryPoints
 PEAK_ACCELERATION_OF_BRAKING = 1.5
 """Largest acceleration while a joint brakes, in units of its rate over the duration."""
 SHORTEST_BRAKING = 1e-3
-"""Nothing stops in less, s."""
+"""Least braking time, s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +22,8 @@ class JointTrajectory:
     """
     Polynomials between points, at rest before the first and after the last.
 
-    As in joint_trajectory_controller: of degree five where the points give velocities and accelerations, of degree three with velocities
-    alone, straight lines with positions alone, whose velocity jumps at every point.
+    As in joint_trajectory_controller: of degree five where the points give velocities and accelerations, of degree three with only
+    velocities, straight lines with only positions, so that the velocity jumps at every point.
     """
 
     time: np.ndarray
@@ -102,7 +102,7 @@ def trajectory_from(start: JointMotion, points: TrajectoryPoints) -> JointTrajec
 
 
 def braking_from(start: JointMotion, limits: MotionLimits) -> JointTrajectory:
-    """Return how the joints come to rest within their accelerations, or harder where their range ends before."""
+    """Return the braking trajectory within the acceleration limits, or with more acceleration if the range ends before."""
     position, rate = start.position[0], start.rate[0]
     wanted = float(np.max(PEAK_ACCELERATION_OF_BRAKING * np.abs(rate) / limits.acceleration))
     room = np.where(rate > 0, limits.upper - position, position - limits.lower)
@@ -114,10 +114,10 @@ def braking_from(start: JointMotion, limits: MotionLimits) -> JointTrajectory:
 
 def excess(trajectory: JointTrajectory, limits: MotionLimits, step: float = 0.005) -> tuple[float, float, float]:
     """
-    Return how far a trajectory goes beyond limits.
+    Return the excess of a trajectory over limits.
 
-    Positions beyond the range (rad or m; at most 0 within it), and the largest speed and acceleration in units of theirs. The jumps of
-    straight lines are left out.
+    Positions beyond the range (rad or m; at most 0 within it), and the largest speed and acceleration in units of theirs. Velocity jumps of
+    straight lines are ignored.
     """
     count = max(int(np.ceil((trajectory.end - trajectory.time[0]) / step)), 20)
     motion = trajectory.at(np.union1d(np.linspace(trajectory.time[0], trajectory.end, count + 1), trajectory.time))

@@ -14,7 +14,7 @@ LARGEST_SWING = 0.5
 
 def within_limits(builder: MotionBuilder, rng: np.random.Generator, n_poses: int = 24, *, frequencies: Sequence[float] = (0.25, 0.5, 1.0),
                   swing_time: float = 5.0, n_other: int = 20) -> None:
-    """Poses, swings of one joint and of two at once (with at most `n_other` others) and, where a joint has no end, spins."""
+    """Poses, swings of one joint and of two at once (with at most `n_other` other joints) and, where a joint has no end, spins."""
     limits, count = builder.limits, builder.n_joints
     lower, upper = np.where(limits.endless, -np.pi, limits.lower), np.where(limits.endless, np.pi, limits.upper)
     moving = np.flatnonzero(upper > lower)
@@ -24,7 +24,7 @@ def within_limits(builder: MotionBuilder, rng: np.random.Generator, n_poses: int
         return lower + (upper - lower) * (rng.permuted(np.tile(np.arange(n), (count, 1)), axis=1).T + 0.5) / n
 
     def swing(at, frequency):
-        """Swing the joints in which `frequency` is not zero, as far as range, speed and acceleration allow."""
+        """Swing the joints in which `frequency` is not zero, up to the limits of range, speed and acceleration."""
         omega = 2 * np.pi * np.maximum(frequency, 1e-9)
         reach = [0.3 * (upper - lower), limits.speed / omega, limits.acceleration / omega**2, np.full(count, LARGEST_SWING)]
         amplitude = np.where(frequency > 0, 0.7 * np.minimum.reduce(reach), 0.0)

@@ -1,4 +1,4 @@
-"""A simulated table with an IMU on it, block after block: what a live simulator publishes."""
+"""A simulated table with an IMU on it, block after block, for a live simulator."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ TEMPERATURE_RATE = 1.0
 
 @dataclass(frozen=True, eq=False)
 class SimulatedBlock:
-    """What happens in a stretch of time."""
+    """Samples of a stretch of time."""
 
     imu: ImuSamples
     """Readings."""
@@ -37,7 +37,7 @@ class SimulatedBlock:
 
 class LiveSimulation:
     """
-    The forward model with noise that goes on from block to block.
+    The forward model with noise that is continuous across blocks.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class LiveSimulation:
     start_ns : int
         Stamp of time zero.
     causes : sequence of Cause
-        What else is wrong with the IMU (`hidden_causes`).
+        Further faults of the IMU (`hidden_causes`).
 
     """
 
@@ -68,7 +68,7 @@ class LiveSimulation:
                         for sd in (noise.accel_instability, noise.gyro_instability)]
 
     def take(self, until: float) -> SimulatedBlock:
-        """Return everything from where the last block ended to `until` (s, exclusive)."""
+        """Return the samples from the end of the last block to `until` (s, exclusive)."""
         time = self._times('imu', self.options.imu_rate, 0.0, until)
         imu, truth = self._imu(time)
         return SimulatedBlock(imu, self._joints(until), self._temperature(until), truth)
@@ -98,7 +98,7 @@ class LiveSimulation:
         return ImuSamples(stamps, *outputs, self.options.frame_id), self._truth(stamps, motion)
 
     def _answered(self, time, motion):
-        """Return what the sensors answer without noise."""
+        """Return the outputs of the sensors without noise."""
         force, rate = answered(self.model, self.values, self.table, motion=motion, time=time, options=self.options)
         if not self.causes:
             return force, rate

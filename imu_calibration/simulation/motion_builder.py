@@ -11,7 +11,7 @@ from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.motion_limits import MotionLimits, free_limits
 
 # Smooth steps from 0 to 1 and their derivatives, lowest power first. A position blended by the septic and a rate blended
-# by the quintic both leave position, rate, acceleration and jerk continuous where segments meet.
+# by the quintic both have continuous position, rate, acceleration and jerk where segments meet.
 _SEPTIC = np.polynomial.Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
 _QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 _POSITION_STEP = [_SEPTIC.deriv(order) for order in range(4)]
@@ -33,7 +33,7 @@ class Segment:
     """
     A stretch of motion of all joints.
 
-    ``position = start + rate blend + shift blend + envelope * sum of sines``: the rate goes from `rate_from` to `rate_to`
+    ``position = start + rate blend + shift blend + envelope * sum of sines``: the rate changes from `rate_from` to `rate_to`
     and the position gains `shift`, both by smooth steps, and the sines fade in and out.
     """
 
@@ -56,7 +56,7 @@ class Segment:
     phase: np.ndarray | None = None
     """Their phases at the start, rad, same shape."""
     fade: float = 0.0
-    """Time over which the sines come and go, s; at most half the duration."""
+    """Time over which the sines fade in and out, s; at most half the duration."""
 
     @property
     def end(self) -> float:
@@ -163,7 +163,7 @@ class MotionBuilder:
     """
     Writes segments one after the other, each starting where the last one ended.
 
-    Angles in degrees here, as people state motions; the segments hold radians. Where joints slide, use the methods that speak SI.
+    Angles are in degrees here, in radians in the segments. For sliding joints, use the methods with SI units.
     """
 
     def __init__(self, n_joints: int, dwell: float = 1.0, limits: MotionLimits | None = None, *, start: np.ndarray | None = None):
@@ -184,11 +184,11 @@ class MotionBuilder:
         return len(self._position)
 
     def rest(self, duration: float) -> None:
-        """Stay for `duration` times dwell, s."""
+        """Rest for `duration` times dwell, s."""
         self._append('rest', duration * self.dwell)
 
     def move(self, angles_deg: ArrayLike, shortest: bool = True) -> None:
-        """Move to the joint angles (NaN: leave that joint), each by less than half a turn when `shortest`."""
+        """Move to the joint angles (NaN: do not move that joint), each by less than half a turn when `shortest`."""
         self.move_to(np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints)), shortest)
 
     def move_to(self, target: np.ndarray, shortest: bool = True) -> None:
@@ -238,7 +238,7 @@ class MotionBuilder:
 
 
 def move_time(distance: np.ndarray, limits: MotionLimits) -> float:
-    """Return how long a move of all joints by `distance`, shape (n_joints,), takes within the limits, s."""
+    """Return the duration of a move of all joints by `distance`, shape (n_joints,), within the limits, s."""
     rate = np.max(PEAK_RATE_OF_MOVE * distance / limits.speed)
     return float(max(SHORTEST_MOVE, rate, np.sqrt(np.max(PEAK_ACCELERATION_OF_MOVE * distance / limits.acceleration))))
 
@@ -250,7 +250,7 @@ def stretch(build: Callable, duration: float) -> list[Segment]:
     Raises
     ------
     InputError
-        When moves and ramps alone leave too little time for rests and spins.
+        When `duration` is below the time of moves and ramps with the shortest dwells.
 
     """
     length = [sum(segment.duration for segment in build(dwell)) for dwell in (1.0, 2.0)]

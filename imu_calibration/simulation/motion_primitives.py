@@ -1,4 +1,4 @@
-"""What a turntable session is made of: poses, spins, swings and simultaneous turns of a table with axes z, y, x from the base outwards."""
+"""Parts of a turntable session: poses, spins, swings and simultaneous turns of a table with axes z, y, x from the base outwards."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -33,7 +33,7 @@ def pose(builder: MotionBuilder, up_b: np.ndarray, heading_deg: float, *, dwell:
 
 
 def spin_vertical(builder: MotionBuilder, up_b: np.ndarray, speeds_deg: ArrayLike, *, dwell: float) -> None:
-    """Turn the outer joint both ways with `up_b` vertical: the body turns about `up_b` and gravity stays where it is."""
+    """Turn the outer joint both ways with `up_b` vertical: the body turns about `up_b` and gravity is constant in it."""
     builder.move(pose_deg(up_b, np.nan))
     builder.spin([[sense * speed, 0.0, 0.0] for speed in np.atleast_1d(speeds_deg) for sense in (1, -1)], dwell)
 
@@ -68,13 +68,13 @@ def tumble(builder: MotionBuilder, amplitude_deg: ArrayLike, frequency: ArrayLik
 
 
 def rest_at_zero(builder: MotionBuilder, dwell: float) -> None:
-    """Rest at the reference pose: zero, or what is nearest to it within the limits."""
+    """Rest at the reference pose: zero, or the nearest pose within the limits."""
     builder.move_to(builder.home)
     builder.rest(dwell)
 
 
 def run(builder: MotionBuilder, rng: np.random.Generator, tasks: Sequence[Callable], *, reference_every: int = 12) -> None:
-    """Run tasks in a drawn order; come back to the reference pose now and then, so that drift is not taken for anything else."""
+    """Run tasks in a random order, with returns to the reference pose, so that drift is separable from other effects."""
     rest_at_zero(builder, 8.0)
     for count, index in enumerate(rng.permutation(len(tasks)), start=1):
         tasks[index](builder)

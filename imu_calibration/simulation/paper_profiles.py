@@ -12,7 +12,7 @@ ORDERS = ('XYX', 'XYZ', 'XZX', 'XZY', 'YXY', 'YXZ', 'YZX', 'YZY', 'ZXY', 'ZXZ', 
 """The twelve orders of three gimbals, from the base outwards."""
 AXIS = {'X': [1.0, 0.0, 0.0], 'Y': [0.0, 1.0, 0.0], 'Z': [0.0, 0.0, 1.0]}
 EQUAL_ANGLES_DEG = np.arange(0.0, 401.0, 10.0)
-"""Avrutov 2017, samples 1 and 2: the 41 equal angles (the paper says 40)."""
+"""Avrutov 2017, samples 1 and 2: the 41 equal angles (40 according to the paper)."""
 
 
 def _table(axes, up=(0.0, 0.0, 1.0), latitude=50.45, height=170.0, rpy_deg=(0.0, 0.0, 0.0)):

@@ -39,12 +39,12 @@ SPEEDS_DEG = (60.0, 120.0, 200.0)
 class _Entry:
     description: str
     build: Callable
-    """``build(builder, rng)`` appends the segments; `rng` comes from the seed."""
+    """``build(builder, rng)`` appends the segments; `rng` is seeded."""
     table: dict | None = None
     n_joints: int | None = None
     """Joints that it needs; None: any number."""
     adapts: bool = False
-    """Whether a table with another number of joints gets `any_table` instead, and one whose joints have ends `within_limits`."""
+    """Whether a table with another number of joints gets `any_table` instead, and one with joint limits `within_limits`."""
 
 
 def profile_names() -> dict[str, str]:
@@ -61,10 +61,10 @@ def make_profile(name: str, seed: int = 0, table: dict[str, Any] | Table | None 
     name : str
         One of `profile_names`.
     seed : int
-        Seed of what is drawn: the order of the session, and in 'random' the motions themselves.
+        Seed of the order of the session, and in 'random' of the motions themselves.
     table : Table, optional
         The table to be moved; default three axes. Sessions for three axes become poses, spins and swings of every joint
-        on a table with another number of joints, and stay within the limits where joints have ends. Profiles that bring their own
+        on a table with another number of joints, and are within the limits of joints that have them. Profiles with their own
         table (`Profile.table`) ignore it.
     duration : float, optional
         Wanted length, s; rests and spins are stretched to reach it.
@@ -72,7 +72,7 @@ def make_profile(name: str, seed: int = 0, table: dict[str, Any] | Table | None 
     Raises
     ------
     InputError
-        When the name is unknown, the table does not suit the profile, a joint would go beyond its limits, or the duration is too short.
+        When the name is unknown, the table does not suit the profile, a joint would exceed its limits, or the duration is too short.
 
     """
     if name not in _REGISTRY:
@@ -99,7 +99,7 @@ def make_profile(name: str, seed: int = 0, table: dict[str, Any] | Table | None 
 
 
 def _require_within(profile, limits):
-    """Refuse a motion that leaves the range of a joint."""
+    """Refuse a motion that exceeds the range of a joint."""
     if limits.endless.all():
         return
     position = profile.at(np.linspace(0.0, profile.duration, int(20 * profile.duration) + 1)).position
@@ -152,7 +152,7 @@ def _quick(builder, rng):
 
 
 def _six_faces(builder, _rng):
-    """What is usually driven: every axis up and down, and turned both ways at one speed."""
+    """The usual motion: every axis up and down, and turned both ways at one speed."""
     builder.rest(3.0)
     for task in poses(FACES, 3.0):
         task(builder)
@@ -166,7 +166,7 @@ def _static_only(builder, rng):
 
 
 def _separating(builder, rng, n_angles=16, n_oblique=4, cycles=((40.0, 0.4), (10.0, 1.0), (4.0, 2.0), (2.0, 4.0)), swing_time=4.0):
-    """Many angles, three speeds both ways, swings at several frequencies: what tells neighbours among the effects apart."""
+    """Many angles, three speeds both ways, swings at several frequencies: separates similar effects."""
     rings = [direction for k in range(n_angles) for direction in _rings(2 * np.pi * (k + 0.25) / n_angles)]
     tasks = poses(rings, 2.2)
     tasks += [partial(spin_vertical, up_b=axis, speeds_deg=(60.0, 150.0, 300.0), dwell=2.0) for axis in np.eye(3)]

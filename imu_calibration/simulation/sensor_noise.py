@@ -1,4 +1,4 @@
-"""Noise of inertial sensors, encoders and clocks, and the grades of sensors it comes in."""
+"""Noise of inertial sensors, encoders and clocks, and grades of sensors."""
 
 from dataclasses import dataclass, replace
 
@@ -10,9 +10,9 @@ from imu_calibration.constants import DEG, DEG_H, MICRO_G, STANDARD_GRAVITY
 @dataclass(frozen=True)
 class SimulatedNoise:
     """
-    Random errors of one IMU and of what it is compared with.
+    Random errors of one IMU and of its reference.
 
-    The bias wander is a stationary first-order Gauss-Markov process whose standard deviation is the data sheet's
+    The bias wander is a stationary first-order Gauss-Markov process; its standard deviation is the data sheet's
     in-run instability.
     """
 
@@ -38,7 +38,7 @@ class SimulatedNoise:
     """Step of the joint positions, rad; 0: continuous."""
 
     def white_only(self) -> 'SimulatedNoise':
-        """Return the model with nothing but the white noise of the IMU."""
+        """Return the model with only the white noise of the IMU."""
         return SimulatedNoise(accel_density=self.accel_density, gyro_density=self.gyro_density)
 
 
@@ -59,7 +59,7 @@ class ImuGrade:
     arm: float
     """Distance of a sensitive point from the middle of the package, m."""
     source: str
-    """Where the figures come from."""
+    """Source of the figures."""
 
 
 GRADES = {
@@ -84,7 +84,7 @@ GRADES = {
 
 
 def realistic(grade: str = 'industrial', encoder_resolution: float = 0.001 * DEG, stamp_jitter: float = 50e-6) -> SimulatedNoise:
-    """Return the noise of a grade, with an encoder's resolution (rad) and a stamp jitter (s) beside it."""
+    """Return the noise of a grade, with an encoder's resolution (rad) and a stamp jitter (s)."""
     return replace(GRADES[grade].noise, encoder_resolution=encoder_resolution, stamp_jitter=stamp_jitter)
 
 
@@ -96,7 +96,7 @@ def gauss_markov(standard_deviation: float | np.ndarray, correlation_time: float
     ``x[k] = a x[k-1] + sd sqrt(1 - a^2) w[k]`` with ``a = exp(-step / correlation_time)``, started from its stationary
     distribution.
     """
-    from scipy.signal import lfilter  # here, because scipy.signal takes a second to import
+    from scipy.signal import lfilter  # here, because the import of scipy.signal is slow (1 s)
     decay = np.exp(-step / correlation_time)
     drive = rng.normal(0.0, standard_deviation, shape)
     drive[1:] *= np.sqrt(-np.expm1(-2.0 * step / correlation_time))
@@ -104,12 +104,12 @@ def gauss_markov(standard_deviation: float | np.ndarray, correlation_time: float
 
 
 def quantise(values: np.ndarray, step: float) -> np.ndarray:
-    """Round `values` to multiples of `step`; 0 leaves them as they are."""
+    """Round `values` to multiples of `step`; 0: unchanged."""
     return np.asarray(values) if step == 0.0 else np.round(np.asarray(values) / step) * step
 
 
 def jitter_stamps(stamp_ns: np.ndarray, standard_deviation: float, rng: np.random.Generator) -> np.ndarray:
-    """Return stamps that came with white jitter (s), still int64 and in the order of arrival."""
+    """Return stamps with white jitter (s), still int64 and in the order of arrival."""
     if standard_deviation == 0.0:
         return stamp_ns
     return stamp_ns + np.round(rng.normal(0.0, standard_deviation * 1e9, len(stamp_ns))).astype(np.int64)
@@ -141,5 +141,5 @@ def add_imu_noise(force_s: np.ndarray, rate_s: np.ndarray, model: SimulatedNoise
 
 
 def read_encoders(position: np.ndarray, model: SimulatedNoise, rng: np.random.Generator) -> np.ndarray:
-    """Return joint positions as noisy encoders of finite resolution tell them, rad, shape (n, n_joints)."""
+    """Return joint positions as read by noisy encoders of finite resolution, rad, shape (n, n_joints)."""
     return quantise(position + rng.normal(0.0, model.encoder_noise, np.shape(position)), model.encoder_resolution)

@@ -36,7 +36,7 @@ class SimulationOptions:
     temperature_start_c: float | None = None
     """Temperature at turn-on; None: no temperature topic."""
     temperature_rise_c: float = 15.0
-    """How far it rises."""
+    """Temperature rise, K."""
     temperature_time: float = 240.0
     """Time constant of the warm-up, s."""
     frame_id: str = 'imu_link'
@@ -47,7 +47,7 @@ def random_values(model: SensorModel, grade: str = 'industrial', seed: int = 0) 
     """
     Return parameter values of a random IMU of a grade, shape (n_params,).
 
-    Bias, matrix and arms scatter as the grade says; every other effect is zero.
+    Bias, matrix and arms scatter with the sd of the grade; every other effect is zero.
     """
     rng, grade = np.random.default_rng([seed, 7]), GRADES[grade]
     values = model.start()
@@ -128,7 +128,7 @@ def _outputs(model, values, table, profile, time, options):
 
 def answered(model: SensorModel, values: np.ndarray, table: Table, *, motion: JointMotion, time: np.ndarray,
              options: SimulationOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Return what the sensors answer without noise, each (n, 3): to motion, warm-up, and a machine where biases follow vibration."""
+    """Return the outputs of the sensors without noise, each (n, 3): motion, warm-up, and a machine if biases depend on vibration."""
     motion, hum = replace(motion, thermal_branch=branch_at(time, options)), 0.0
     if model.uses('vibration'):
         hum, variance = hum_and_variance(time, options.imu_rate)

@@ -1,4 +1,4 @@
-"""What drives the simulated table: a profile, then the trajectories that come, as joint_trajectory_controller and real joints take them."""
+"""Controller of the simulated table: a profile, then received trajectories, as with joint_trajectory_controller and real joints."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from imu_calibration.simulation.joint_trajectory import JointTrajectory, braking
 from imu_calibration.simulation.motion_builder import Profile
 
 ROUNDING = 1e-6
-"""What a trajectory may lie beyond a limit, relative to it."""
+"""Tolerance of a trajectory beyond a limit, relative to it."""
 LIMIT_CHOICES = ('refuse', 'slow', 'none')
 KEPT = 8
-"""Motions that are remembered; whoever asks looks back by less."""
+"""Motions kept in memory; queries look back by less."""
 
 
 @dataclass(frozen=True)
 class ControllerSettings:
-    """How the joints take a trajectory, and what goes wrong with them."""
+    """Execution of a trajectory by the joints, and their faults."""
 
     limits: str = setting('refuse', '', 'treatment of a trajectory beyond range, speed or acceleration of the joints: refuse, slow (it '
                           'is slowed to the limits; beyond the range it is refused) or none (it is followed)',
@@ -39,12 +39,12 @@ class ControllerSettings:
 
 class TableController:
     """
-    What the table does at any time: a profile, once or again and again, until a trajectory takes over.
+    Motion of the table at any time: a profile, once or repeated, until a trajectory replaces it.
 
     Parameters
     ----------
     profile : Profile or None
-        None: rest until a trajectory comes.
+        None: rest until a trajectory arrives.
     joint_names : sequence of str
         Joints in the order of the columns.
     limits : MotionLimits, optional
@@ -56,7 +56,7 @@ class TableController:
     Raises
     ------
     InputError
-        When a setting names what is not there.
+        When a setting has an unknown value.
 
     """
 
@@ -80,12 +80,12 @@ class TableController:
 
     def follow(self, now: float, points: TrajectoryPoints) -> None:
         """
-        Let a trajectory that arrives at the time `now` take over; without points the joints brake and rest.
+        Start a trajectory that arrives at the time `now`; without points the joints brake and rest.
 
         Raises
         ------
         InputError
-            When it is refused; the joints then do what they did.
+            When it is refused; the joints then continue their present motion.
 
         """
         points = points.ordered(self.joint_names)
@@ -134,7 +134,7 @@ class TableController:
         return motion
 
     def _commanded(self, time):
-        """What the joints would do if none of them stalled."""
+        """Motion of the joints if none of them stalled."""
         begins = np.array([begin for begin, _ in self._taken])
         which = np.searchsorted(begins, time, side='right') - 1
         parts = np.zeros((4, len(time), len(self.joint_names)))
@@ -145,7 +145,7 @@ class TableController:
         return JointMotion(time, *parts)
 
     def _before(self, time):
-        """What the joints do before the first trajectory."""
+        """Motion of the joints before the first trajectory."""
         if self._profile is None:
             zero = np.zeros((len(time), len(self.joint_names)))
             return JointMotion(time, zero + self._home, zero, zero, zero)
