@@ -19,7 +19,7 @@ from msg_adapters.storages import BagSource, suffixes
 from msg_adapters.temperature import TEMPERATURE_TYPE
 
 KEYS = {IMU_TYPE: 'imu_topic', JOINT_STATE_TYPE: 'joint_topic', TEMPERATURE_TYPE: 'temperature_topic'}
-"""What an error calls the choice of a topic."""
+"""Key in errors for the choice of a topic."""
 
 BLOCK_SAMPLES = 65536
 """IMU and joint samples per block, about."""
@@ -34,14 +34,14 @@ class Topic:
     type: str
     """Message type, as in sensor_msgs/msg/Imu."""
     count: int
-    """Messages that the recording says it holds."""
+    """Number of messages by the recording's metadata."""
 
 
 def open_recording(path: str | PathLike[str], imu_topic: str | None = None, joint_topic: str | None = None, *,
                    temperature_topic: str | None = None, want_joints: bool | str = True,
                    want_temperature: bool | str = True, frame_id: str | None = None) -> 'Recording':
     """
-    Open a bag and choose its topics: the one that is named, else the default name, else the only one of the type.
+    Open a bag and choose its topics: by the given name, the default name, or the only one of the type, in this order.
 
     Parameters
     ----------
@@ -50,9 +50,9 @@ def open_recording(path: str | PathLike[str], imu_topic: str | None = None, join
     imu_topic, joint_topic, temperature_topic : str, optional
         Names of topics.
     want_joints : bool or 'optional'
-        True: refuse a recording without JointState; 'optional': go on without where there is none, or no telling which.
+        True: refuse a recording without JointState; 'optional': read none where the topic is missing or ambiguous.
     want_temperature : bool or 'optional'
-        Whether to read temperatures when the recording has them; 'optional': go on without where there is no telling which.
+        Whether to read temperatures when the recording has them; 'optional': read none where the topic is ambiguous.
     frame_id : str, optional
         Frame of the Imu messages that are read; needed for a topic with messages of several frames.
 
@@ -94,12 +94,12 @@ class Recording:
 
     @property
     def message_counts(self) -> dict[str, int]:
-        """Topic name -> messages that the recording says it holds."""
+        """Topic name -> number of messages by the recording's metadata."""
         return {topic.name: topic.count for topic in self.topics}
 
     @property
     def n_messages(self) -> int:
-        """Messages on the chosen topics, as far as the recording says; for progress."""
+        """Messages on the chosen topics by the recording's metadata; for progress."""
         counts = self.message_counts
         return sum(counts[name] for name in (self.imu_topic, self.joint_topic, self.temperature_topic) if name)
 
@@ -110,7 +110,7 @@ class Recording:
 
     @property
     def lost(self) -> dict[str, int]:
-        """What could not be read, reason -> count; complete when `blocks` has run to its end."""
+        """Unreadable data, reason -> count; complete when `blocks` has run to its end."""
         return dict(self.source.lost)
 
     def blocks(self, joint_names: Iterable[str] | None = None, block_samples: int = BLOCK_SAMPLES) -> Generator[SampleBlock, None, None]:
@@ -197,7 +197,7 @@ class Recording:
 
 
 def _block(parts, decoders):
-    """Join the parts of a block and take over what the decoders dropped since the last one."""
+    """Join the parts of a block and add the counts of messages dropped by the decoders since the last one."""
     dropped, notes = taken_counts(decoders.values())
     joined = {kind: kind.concatenate(samples) for kind, samples in parts.items()}
     return SampleBlock(joined.get(ImuSamples), joined.get(JointSamples), joined.get(TemperatureSamples), dropped, notes)
@@ -232,7 +232,7 @@ def list_topics(path: str | PathLike[str]) -> tuple[Topic, ...]:
 
 
 def imu_topics(topics: tuple[Topic, ...]) -> list[str]:
-    """Return the names of those Topics that carry IMU messages."""
+    """Return the names of the Topics with IMU messages."""
     return [topic.name for topic in topics if topic.type == IMU_TYPE]
 
 

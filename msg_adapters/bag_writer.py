@@ -1,4 +1,4 @@
-"""A new rosbag2 folder, made beside its place and renamed when it is complete."""
+"""A new rosbag2 folder, written under a temporary name and renamed when it is complete."""
 
 import os
 import shutil
@@ -29,7 +29,7 @@ class BagWriter:
     path : path-like
         The folder to make.
     storage : str
-        What rosbag2 calls one of `storages.STORAGES`.
+        Name in rosbag2 of one of `storages.STORAGES`.
     options : dict
         Passed to the storage (`compression` of the chunks of an mcap).
 
@@ -77,7 +77,7 @@ class BagWriter:
         os.rename(self.partial, self.path)
 
     def abort(self) -> None:
-        """Throw away what has been written."""
+        """Delete the written data."""
         self.storage.abort()
         shutil.rmtree(self.partial, ignore_errors=True)
 
@@ -107,7 +107,7 @@ class BagWriter:
 
 
 def make_partial_folder(path: Path) -> Path:
-    """Make the folder beside `path` in which it is built (raises InputError when `path` exists or cannot be written)."""
+    """Make the temporary folder next to `path` (raises InputError when `path` exists or cannot be written)."""
     path = Path(path)
     if path.exists():
         raise InputError(f'{path} must not exist yet; remove it or choose another name', code='exists_already')

@@ -1,4 +1,4 @@
-"""Compressed files, chunks and messages, within limits; a stream that is cut off gives what came before the cut."""
+"""Compressed files, chunks and messages, within limits; a truncated stream gives its data before the cut."""
 
 import bz2
 import shutil
@@ -24,7 +24,7 @@ FILE_BASE, FILE_RATIO = 256 << 20, 100
 
 @cache
 def zstd() -> ModuleType:
-    """Return the zstd module: of the standard library where it has it, else of the package that rosbags brings along."""
+    """Return the zstd module: of the standard library where available, otherwise of the package that rosbags requires."""
     if sys.version_info >= (3, 14):
         from compression import zstd as module
     else:
@@ -33,7 +33,7 @@ def zstd() -> ModuleType:
 
 
 def decompress_chunk(compression: str, packed: memoryview, size: int) -> bytes:
-    """Return the content of a chunk, at most the `size` bytes that its header declares, or what can be had of it (raises McapDamage)."""
+    """Return the content of a chunk, at most the `size` bytes that its header declares, or its readable part (raises McapDamage)."""
     if size > LARGEST_CHUNK:
         raise McapDamage(f'a chunk of {size} bytes, more than the {LARGEST_CHUNK} that are accepted')
     try:
@@ -69,7 +69,7 @@ def _errors():
 
 
 def decompress_message(data: bytes) -> bytes:
-    """Return one message of a bag that is compressed by message (raises ValueError for one that expands too far)."""
+    """Return one message of a bag that is compressed by message (raises ValueError for one that expands too much)."""
     limit = min(LARGEST_MESSAGE, MESSAGE_BASE + FILE_RATIO * len(data))
     plain = decompress('zstd', data, limit)
     if len(plain) == limit:
@@ -86,7 +86,7 @@ def decompress_file(source: Path, target: Path) -> str | None:
     """
     Decompress a zstd file into another; return the error that ended it early, or None.
 
-    What was decompressed before the damage is written in any case.
+    Data decompressed before the damage are written in any case.
 
     Raises
     ------

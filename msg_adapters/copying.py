@@ -1,4 +1,4 @@
-"""A copy of a recording with a corrected Imu topic beside the others; everything else stays as it is, to the last bit."""
+"""A copy of a recording with an additional corrected Imu topic; all other data are copied bit by bit."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -24,10 +24,10 @@ def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike
                         mat_ts: np.ndarray | None = None, late_ns: int = 0, storage: str | None = None,
                         source_frame_id: str | None = None) -> dict[str, int]:
     """
-    Write a bag with all topics of another one and the corrected Imu messages behind the measured ones.
+    Write a bag with all topics of another one and each corrected Imu message after the measured one.
 
-    Stamps, and whatever is not corrected, come from the measured message. Its covariances follow the message definition: an
-    absent quantity (first element -1) is left alone, the others go through `propagate`.
+    Stamps and uncorrected fields are copied from the measured message. Its covariances follow the message definition: an
+    absent quantity (first element -1) is unchanged, `propagate` is applied to the present ones.
 
     Parameters
     ----------
@@ -37,14 +37,14 @@ def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike
         Topic to correct, and name of the new one.
     correct : callable
         ImuSamples -> object with `force` and `rate`, each (n, 3), for one block after the other in the order of the file; and
-        with `marks` (n, 2), variances that take the place of the covariances of (force, rate) where they are not zero.
+        with `marks` (n, 2), variances that replace the covariances of (force, rate) where they are not zero.
     propagate : callable, optional
-        Asked after each block for each distinct pair of covariances: measured (force, rate), each (3, 3) or None when unknown ->
+        Called after each block for each distinct pair of covariances: measured (force, rate), each (3, 3) or None when unknown ->
         corrected (force, rate).
     frame_id : str, optional
         New frame of the corrected messages; `mat_ts` (target from sensor) then turns the orientation.
     late_ns : int
-        Taken from the stamps of the corrected messages.
+        Subtracted from the stamps of the corrected messages.
     storage : str, optional
         'sqlite3' or 'mcap'; default as the source.
     source_frame_id : str, optional
@@ -53,12 +53,12 @@ def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike
     Returns
     -------
     lost : dict
-        What could not be read or corrected, reason -> count.
+        Messages that could not be read or corrected, reason -> count.
 
     Raises
     ------
     InputError
-        When the source does not fit or the destination cannot be written; nothing is left behind then.
+        When the source is unsuitable or the destination cannot be written; all partial output is removed.
 
     """
     with open_recording(source, imu_topic, want_joints=False, want_temperature=False) as recording:
@@ -93,7 +93,7 @@ def _check(recording, corrected_topic):
 
 
 def _write(writer, topic_ids, raw, measured, corrected_id, patch):
-    """Write one stretch, every corrected message behind the measured one."""
+    """Write one stretch, every corrected message after the measured one."""
     messages = [raw.packed.view(k) for k in range(len(raw.packed))]
     done, corrected = patch(raw.packed.select(measured), raw.received_ns[measured]) if len(measured) else (measured, [])
     measured = measured[done]

@@ -30,7 +30,7 @@ class CsvBag(Rosbag2):
 
 
 class ConvertedLog:
-    """The temporary bag of a text log; its folder is removed when nothing refers to it, or at exit."""
+    """The temporary bag of a text log; its folder is removed with the last reference, or at exit."""
 
     def __init__(self, path: Path):
         log, folder = read_csv(path), mkdtemp(prefix='imu_calibration_')

@@ -1,4 +1,4 @@
-"""Messages of one topic to samples: whole groups of one layout at once, or object by object."""
+"""Messages of one topic to samples: complete groups of one layout at once, or object by object."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -31,7 +31,7 @@ class Decoder:
     message_type : str
         Imu or Temperature; JointState has its own class.
     deserialize : callable, optional
-        Message bytes -> message object, for messages that are not standard CDR: every one then takes this general path.
+        Message bytes -> message object, for messages that are not standard CDR: all are then decoded in this general way.
 
     """
 
@@ -43,13 +43,13 @@ class Decoder:
 
     def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
         """
-        Return the samples of a Packed in its order, or None when there are none; counts in `dropped` what it cannot use.
+        Return the samples of a Packed in its order, or None when there are none; counts unusable messages in `dropped`.
 
         Parameters
         ----------
         packed : Packed
         arrived_ns : callable, optional
-            Returns when the messages were sent or received, int64, shape (n,): the time of those whose stamp is zero, counted in `notes`.
+            Returns the times of sending or reception, int64, shape (n,): used for messages whose stamp is zero, counted in `notes`.
 
         """
         if self.deserialize is not None:
@@ -165,7 +165,7 @@ class JointDecoder(Decoder):
     Parameters
     ----------
     joint_names : sequence of str, optional
-        Joints of the table; default: those of the first message that names any.
+        Joints of the table; default: the joints of the first message that names any.
     deserialize : callable, optional
         As for Decoder.
 
@@ -182,16 +182,16 @@ class JointDecoder(Decoder):
         self.from_rows = lambda rows: joints_from_rows(rows, self.names)
 
     def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
-        """As for Decoder; raises InputError when the names have not matched those of the table for long."""
+        """As for Decoder; raises InputError when the names have not matched the table's for a number of messages."""
         return self._checked(super().decode(packed, arrived_ns), len(packed) if self.deserialize is None else 0)
 
     def decode_objects(self, messages: Iterable, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
-        """As for Decoder; raises InputError when the names have not matched those of the table for long."""
+        """As for Decoder; raises InputError when the names have not matched the table's for a number of messages."""
         messages = list(messages)
         return self._checked(super().decode_objects(messages, arrived_ns), len(messages))
 
     def check(self) -> None:
-        """Raise InputError when no message so far has held the joints of the table."""
+        """Raise InputError when no message so far contains the joints of the table."""
         if self.asked and self.seen and not self.n_fitting:
             if any(set(self.names) <= set(names) for names in self.seen):
                 raise InputError('JointState must have one position for each named joint, the messages so far do not; correct the '
@@ -218,7 +218,7 @@ class JointDecoder(Decoder):
 
 
 def taken_counts(decoders: Iterable[Decoder]) -> tuple[dict[str, int] | None, ...]:
-    """Return ({reason: messages dropped}, {reason: messages used in another way than they came}) since the last call; None for none."""
+    """Return ({reason: messages dropped}, {reason: messages used with a change}) since the last call; None for none."""
     totals: tuple[Counter[str], ...] = Counter(), Counter()
     for decoder in decoders:
         for total, own in zip(totals, (decoder.dropped, decoder.notes), strict=True):

@@ -42,32 +42,32 @@ _STANDARD = {
 
 
 class TypeDefinition(NamedTuple):
-    """What a bag stores about a message type."""
+    """A bag's entry for a message type."""
 
     type: str
     """Name, as in sensor_msgs/msg/Imu."""
     encoding: str
     """'ros2msg' or 'ros2idl'."""
     text: str
-    """The definition with everything it uses; may be empty."""
+    """The definition with all nested types; may be empty."""
     digest: str
     """RIHS01 hash; may be empty."""
 
 
 def standard_definition(message_type: str) -> TypeDefinition:
-    """Return the TypeDefinition of a type that this package knows."""
+    """Return the TypeDefinition of a type that this package supports."""
     text, parts, digest = _STANDARD[message_type]
     nested = ''.join(f'{SEPARATOR}\nMSG: {part}\n{_PARTS[part]}' for part in parts)
     return TypeDefinition(message_type, 'ros2msg', text + nested, digest)
 
 
 def is_standard_name(message_type: str) -> bool:
-    """Return whether this package knows the type."""
+    """Return whether this package supports the type."""
     return message_type in _STANDARD
 
 
 def is_standard(message_type: str, encoding: str, text: str) -> bool:
-    """Return whether a definition has the fields of the standard one; without a text the standard is taken for granted."""
+    """Return whether a definition has the fields of the standard one; without a text the standard is assumed."""
     if not text:
         return True
     if encoding != 'ros2msg':
@@ -87,7 +87,7 @@ def deserializer(message_type: str, definitions: dict[str, tuple[str, str]], ros
     message_type : str
         Type of the messages.
     definitions : dict
-        Message type -> (encoding, text) of the bag; the current ROS 2 definitions stand in where it has none.
+        Message type -> (encoding, text) of the bag; the current ROS 2 definitions are the default.
     ros1 : bool
         Whether the bytes are of ROS 1.
 
@@ -111,7 +111,7 @@ def deserializer(message_type: str, definitions: dict[str, tuple[str, str]], ros
 
 
 def _require_size(types, message_type):
-    """Refuse a type with far too many elements, one that contains itself, and sequences of nothing: a message of few bytes fills memory."""
+    """Refuse a type with too many elements, recursion, or sequences of an empty type: a message of few bytes would fill the memory."""
     known = {}
 
     def elements(name):
@@ -139,7 +139,7 @@ def _require_size(types, message_type):
 
 
 def _flatten(text):
-    """List the plain fields of a ros2msg definition in order, those of nested types by their path (raises ValueError for far too many)."""
+    """List the plain fields of a ros2msg definition in order, fields of nested types by their path (raises ValueError for too many)."""
     if len(text) > LONGEST:
         raise ValueError('too long')
     n_lines = count()

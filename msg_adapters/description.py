@@ -1,4 +1,4 @@
-"""What a recording says about the robot: its description, the frame of the IMU, how the robot's root stands."""
+"""Data of the robot in a recording: its description, the frame of the IMU, the attitude of the robot's root."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -55,7 +55,7 @@ def transform_rows(message: Any) -> list[tuple[str, str, np.ndarray]]:
 
 
 def _messages(path, imu_topic, topic, message_type, read: Callable[[Any], T]) -> Iterator[T]:
-    """Yield what `read` returns for each message of a topic that can be decoded, nothing when the recording lacks it."""
+    """Yield the result of `read` for each decodable message of a topic; no results when the recording lacks it."""
     with open_recording(path, imu_topic, want_joints=False, want_temperature=False) as recording:
         if recording.source.types.get(topic) == message_type:
             deserialize = recording.deserializer(message_type)

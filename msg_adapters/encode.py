@@ -64,7 +64,7 @@ def rows(table: np.ndarray) -> list[memoryview]:
 
 
 def _head(frame_id, alignment):
-    """Bytes between the stamp and what follows the frame_id, padded."""
+    """Bytes of the frame_id after the stamp, padded for the field that follows."""
     return _padded(_string(frame_id), alignment)
 
 
@@ -74,7 +74,7 @@ def _string(text):
 
 
 def _padded(data, size):
-    """Pad bytes that stand behind the 8 bytes of a stamp, so that their end is aligned."""
+    """Pad bytes that follow the 8 bytes of a stamp, so that their end is aligned."""
     return data + bytes(-len(data) % size)
 
 

@@ -15,25 +15,25 @@ IMU_TYPE = 'sensor_msgs/msg/Imu'
 N_DOUBLES = 37
 FIELDS = {'orientation': slice(0, 4), 'orientation_cov': slice(4, 13), 'rate_s': slice(13, 16), 'rate_cov': slice(16, 25),
           'force_s': slice(25, 28), 'force_cov': slice(28, 37)}
-"""Places in the 37 doubles behind the header: x, y, z, w and row-major 3 x 3 covariances."""
+"""Positions in the 37 doubles after the header: x, y, z, w and row-major 3 x 3 covariances."""
 
 _DOUBLES = {order: struct.Struct(f'{order}{N_DOUBLES}d') for order in '<>'}
 
 
 class ImuMessage(NamedTuple):
-    """One message taken apart."""
+    """One parsed message."""
 
     stamp_ns: int
     """Header stamp."""
     frame_id: str
     """Frame of the readings."""
     doubles: tuple
-    """All 37 numbers in the order of the message; `FIELDS` says which is which."""
+    """All 37 numbers in the order of the message; `FIELDS` gives their positions."""
 
 
 def parse_imu(data: bytes) -> ImuMessage:
     """
-    Take a serialized Imu message apart.
+    Parse a serialized Imu message.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def patch_imu(data: bytes, frame_id: str | None = None, **fields: Sequence[float
     Parameters
     ----------
     data : bytes
-        The message; its stamp and every field that is not named stay as they are, to the last bit.
+        The message; its stamp and every field that is not named are copied bit by bit.
     frame_id : str, optional
         New frame.
     fields : array_like
@@ -80,7 +80,7 @@ def find_imu_layout(data: bytes) -> MessageLayout:
 
 
 def decode_imu(layout: MessageLayout, packed: Packed) -> ImuSamples:
-    """Return the ImuSamples of messages of one layout; what a message declares absent (covariance -1) comes as NaN."""
+    """Return the ImuSamples of messages of one layout; a quantity declared absent (covariance -1) is NaN."""
     readings = {}
     for name, cov in (('force_s', 'force_cov'), ('rate_s', 'rate_cov')):
         values = layout.column(packed, name)
@@ -130,7 +130,7 @@ def imu_row(message: Any) -> tuple[int, tuple[float, float, float], tuple[float,
 
 
 def imu_from_rows(rows: Sequence[Any]) -> ImuSamples:
-    """Return ImuSamples from what `imu_row` gave."""
+    """Return ImuSamples from rows of `imu_row`."""
     stamp_ns, force_s, rate_s, frames = zip(*rows, strict=True)
     return ImuSamples(np.array(stamp_ns, dtype=np.int64), np.array(force_s, dtype=float), np.array(rate_s, dtype=float), frames[0])
 

@@ -1,4 +1,4 @@
-"""What Imu messages carry beside their readings, from their bytes."""
+"""Contents of Imu messages other than their readings, from their bytes."""
 
 from collections import Counter
 
@@ -18,7 +18,7 @@ class ImuHeads:
         self._age: list[float] = []
 
     def add(self, data: bytes, received_ns: int) -> None:
-        """Take a message and when it came, ns since the epoch, 0 where that says nothing; what is no Imu message is left out."""
+        """Add a message and its time of reception, ns since the epoch, 0 if meaningless; invalid Imu messages are skipped."""
         if not self._stream.heads(data):
             try:
                 self._frame_id = self._stream.open(data)
@@ -30,7 +30,7 @@ class ImuHeads:
         self._last = data
 
     def evidence(self) -> MessageEvidence:
-        """Return what came until now."""
+        """Return the evidence from the messages so far."""
         if not self._last:
             return MessageEvidence()
         quaternion, packed = self._stream.orientation(self._last)

@@ -1,4 +1,4 @@
-"""Serialized Imu messages of one stream, taken apart and put together again; what repeats is looked at only where its bytes change."""
+"""Parse and rewrite serialized Imu messages of one stream; repeated parts are parsed only when their bytes change."""
 
 import struct
 from collections.abc import Sequence
@@ -15,12 +15,12 @@ NS = 1_000_000_000
 
 class ImuStream:
     """
-    Where the parts of a stream's messages stand.
+    Positions of the parts of a stream's messages.
 
     Parameters
     ----------
     frame_id : str, optional
-        Frame of the messages that are written; default that of those which are read.
+        Frame of the written messages; default the frame of the read ones.
     late_ns : int
         By how much stamps are moved back.
 
@@ -52,7 +52,7 @@ class ImuStream:
         layout = find_imu_layout(data)
         self._use(layout.order)
         self._order, self._body = data[:2], layout.offsets['orientation'][0]
-        self._head_end = HEAD_AT + 4 + struct.unpack_from(layout.order + 'I', data, HEAD_AT)[0]   # the padding behind it may hold anything
+        self._head_end = HEAD_AT + 4 + struct.unpack_from(layout.order + 'I', data, HEAD_AT)[0]   # the padding after it is arbitrary
         self._head = data[HEAD_AT:self._head_end]
         self._rate_at, self._force_at = layout.offsets['rate_s'][0], layout.offsets['force_s'][0]
         encoded = (layout.names[0] if self._frame_out is None else self._frame_out).encode() + b'\0'
@@ -69,16 +69,16 @@ class ImuStream:
         return self.read(data)
 
     def read(self, data: bytes) -> tuple[int, tuple[float, ...]]:
-        """Return (stamp in ns, readings) of a message whose places are known."""
+        """Return (stamp in ns, readings) of a message of known layout."""
         seconds, nanoseconds = self._stamp.unpack_from(data, STAMP_AT)
         return seconds * NS + nanoseconds, self._readings.unpack_from(data, self._rate_at)
 
     def heads(self, data: bytes) -> bool:
-        """Return whether a message has the head of the one that was opened last, so that everything stands where it stood."""
+        """Return whether a message has the head of the last opened one, so that all positions are equal."""
         return len(data) == self._size and data[HEAD_AT:self._head_end] == self._head and data[:2] == self._order
 
     def forget(self) -> None:
-        """Have the next message opened whatever it is."""
+        """Have the next message opened in any case."""
         self._size = -1
 
     def covariances(self, data: bytes) -> tuple[np.ndarray, ...]:
@@ -101,7 +101,7 @@ class ImuStream:
     def rewritten(self, data: bytes, stamp_ns: int, readings: Sequence[float], *, rate_cov: bytes, force_cov: bytes,
                   orientation: tuple[Sequence[float], bytes] | None = None) -> bytes:
         """
-        Return a message with other readings, the rest as it came.
+        Return a message with new readings, otherwise unchanged.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class ImuStream:
         rate_cov, force_cov : bytes
             From `packed`.
         orientation : (sequence of 4 floats, bytes), optional
-            Quaternion and the bytes of its covariance; with it goes the other frame.
+            Quaternion and the bytes of its covariance; the frame is then replaced too.
 
         """
         tail = self._tail.pack(*readings[:3], rate_cov, *readings[3:], force_cov)

@@ -13,7 +13,7 @@ from msg_adapters.stamps import FRAME_OFFSET, MessageError, UnusableMessage, ali
 JOINT_STATE_TYPE = 'sensor_msgs/msg/JointState'
 
 MOST_JOINTS, LARGEST_HEAD = 1000, 1 << 16
-"""Joints of a message and bytes of their names; comparing names takes time with the square of either."""
+"""Joints of a message and bytes of their names; the time to compare names grows with the square of either."""
 MISSING_JOINT = 'JointState without every joint of the table'
 NO_POSITION = 'JointState without a position for every name'
 
@@ -69,14 +69,14 @@ def joint_row(message: Any, joint_names: Sequence[str]) -> tuple[int, list[float
 
 
 def joints_from_rows(rows: Sequence[tuple[float, Sequence[float], Sequence[float]]], joint_names: Sequence[str]) -> JointSamples:
-    """Return JointSamples from what `joint_row` gave."""
+    """Return JointSamples from rows of `joint_row`."""
     stamp_ns, position, velocity = zip(*rows, strict=True)
     return JointSamples(np.array(stamp_ns, dtype=np.int64), np.array(position, dtype=float), np.array(velocity, dtype=float),
                         tuple(joint_names))
 
 
 def joint_columns(names: Sequence[str], n_positions: int, joint_names: Sequence[str]) -> list[int]:
-    """Return where in a message that names `names` the joints stand (raises UnusableMessage)."""
+    """Return the positions of the joints in a message with `names` (raises UnusableMessage)."""
     names = list(names)
     if len(names) > MOST_JOINTS or any(name not in names for name in joint_names):
         raise UnusableMessage(MISSING_JOINT)

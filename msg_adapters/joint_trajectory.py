@@ -1,4 +1,4 @@
-"""trajectory_msgs/JointTrajectory: what is asked of the joints, as a message and back."""
+"""trajectory_msgs/JointTrajectory: command to the joints, to a message and back."""
 
 import struct
 from typing import Any
@@ -65,7 +65,7 @@ def trajectory_from_message(message: Any) -> TrajectoryPoints:
 
 
 class _Writer:
-    """Lays numbers behind each other, each aligned to its size as seen from behind the encapsulation."""
+    """Writes consecutive numbers, each aligned to its size relative to the end of the encapsulation."""
 
     def __init__(self):
         self.data = bytearray(b'\0\x01\0\0')

@@ -1,4 +1,4 @@
-"""Serialized messages in bulk: where they lie in a buffer, and columns of numbers taken out of many at once."""
+"""Serialized messages in bulk: their positions in a buffer, and columns of numbers extracted from many at once."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -54,11 +54,11 @@ class MessageLayout:
     order: str
     """Byte order, '<' or '>'."""
     size: int
-    """Bytes of the message that `sample` was taken from."""
+    """Bytes of the message that is the source of `sample`."""
     sample: bytes
     """The message that the layout was found from."""
     fixed: tuple
-    """Ranges (first, last + 1) of bytes that must equal those of `sample`; padding and numbers lie outside."""
+    """Ranges (first, last + 1) of bytes that must equal the bytes of `sample`; padding and numbers are outside."""
     offsets: dict
     """Field name -> (offset of its first double, number of doubles)."""
     names: tuple = ()
@@ -85,7 +85,7 @@ class MessageLayout:
         count = length if count is None else count
         if not count:
             return np.empty((len(packed), 0))
-        # One gather of the whole row: several times faster than a gather number by number.
+        # One gather of the complete row: several times faster than a gather number by number.
         rows = overlapping(packed.buffer, f'V{8 * count}')[packed.start + offset]
         return rows.view(self.order + 'f8').reshape(-1, count).astype(float, copy=False)
 
@@ -106,7 +106,7 @@ def group_by_layout(packed: Packed, find_layout: Callable) -> tuple[list[tuple[M
     groups : list of (MessageLayout, index, Packed)
         Integer indices in ascending order per group, and these messages.
     rest : ndarray
-        Indices of the messages that no group holds: broken ones, and what is left after `MAX_LAYOUTS`.
+        Indices of the messages that no group holds: invalid ones, and ungrouped ones after `MAX_LAYOUTS`.
 
     """
     groups, broken, rest = [], [], np.arange(len(packed))

@@ -1,4 +1,4 @@
-"""What arrives on topics, gathered into blocks: the same samples that a bag would give."""
+"""Messages received on topics, collected into blocks: the same samples as from a bag."""
 
 import threading
 from collections import deque
@@ -25,11 +25,11 @@ class LiveGatherer:
     Parameters
     ----------
     joint_names : sequence of str, optional
-        Joints of the table, in its order; default: those of the first message.
+        Joints of the table, in its order; default: the joints of the first message.
     max_messages : int
-        Messages of one kind that are kept at most; the oldest go first and are counted as dropped.
+        Largest number of stored messages of one kind; the oldest are discarded first and counted as dropped.
     frame_id : str, optional
-        Imu messages of another frame are counted as dropped; '' takes the frame of the first message, None any frame.
+        Imu messages of another frame are counted as dropped; '' selects the frame of the first message, None any frame.
 
     """
 
@@ -55,7 +55,7 @@ class LiveGatherer:
 
     def flush(self) -> SampleBlock:
         """
-        Return what was added since the last call as a SampleBlock.
+        Return the messages since the last call as a SampleBlock.
 
         Raises
         ------
@@ -70,12 +70,12 @@ class LiveGatherer:
 
 class FrameDecoder(Decoder):
     """
-    Decode Imu messages of one frame; those of others are counted as dropped.
+    Decode Imu messages of one frame; messages of other frames are counted as dropped.
 
     Parameters
     ----------
     frame_id : str
-        The frame; '' takes that of the first message.
+        The frame; '' selects that of the first message.
 
     """
 

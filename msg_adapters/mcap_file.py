@@ -1,4 +1,4 @@
-"""rosbag2 mcap storage, read from front to back; the summary is used for topics and counts, and to go on behind damage."""
+"""rosbag2 mcap storage, read from front to back; the summary is used for topics and counts, and to continue after damage."""
 
 import os
 import struct
@@ -43,7 +43,7 @@ from msg_adapters.read_ahead import read_ahead
 from msg_adapters.storage import StorageFile, Stretch
 
 FIRST_BYTES = 1 << 16
-"""Read at once of messages outside of chunks; doubled up to `STRETCH_BYTES` while nothing else lies between them."""
+"""Bytes read at once of messages outside of chunks; doubled up to `STRETCH_BYTES` while no other record is between them."""
 STRETCH_BYTES = 4 << 20
 """Chunks are joined to about this size before they are decoded."""
 FOOTER_SIZE = PREFIX.size + 20
@@ -81,7 +81,7 @@ class McapFile(StorageFile):
 
     @property
     def types(self) -> dict[str, str]:
-        """Topic -> message type; other serializations than CDR are named behind the type."""
+        """Topic -> message type; serializations other than CDR are named after the type."""
         types = {}
         for channel in self.channels.values():
             name = self.schemas[channel.schema_id].name if channel.schema_id in self.schemas else 'unknown'
@@ -102,7 +102,7 @@ class McapFile(StorageFile):
         return dict(counts)
 
     def time_range(self) -> tuple[int, int] | None:
-        """Return (first, last) receive time in ns, or None when the file does not say."""
+        """Return (first, last) receive time in ns, or None when the file lacks it."""
         first, last, counts = self.statistics
         return (first, last) if any(counts.values()) and last else None
 
@@ -172,9 +172,9 @@ class McapFile(StorageFile):
 
     def _records(self):
         """
-        Yield (opcode, position, length, None) of the records of the data section; a chunk that is cut off comes with what is left.
+        Yield (opcode, position, length, None) of the records of the data section; a truncated chunk is yielded with its remaining bytes.
 
-        Messages outside of chunks come many at once, with (buffer, Messages, other records) in place of None.
+        Messages outside of chunks are yielded in groups, with (buffer, Messages, other records) in place of None.
         """
         position = len(MAGIC)
         self.n_unpacked = 0
@@ -201,13 +201,13 @@ class McapFile(StorageFile):
                 position = behind
 
     def _resume(self, position):
-        """Count the damage at `position` and return the start of the next chunk that the summary knows, or None."""
+        """Count the damage at `position` and return the start of the next chunk in the summary, or None."""
         following = self._following(position)
         self._lose('bytes that are no whole record', max((following or self.size) - position, 1))
         return following
 
     def _following(self, position):
-        """Return the first known start of a chunk behind `position`, or None."""
+        """Return the first known start of a chunk after `position`, or None."""
         place = bisect_right(self.chunk_starts, position)
         return self.chunk_starts[place] if place < len(self.chunk_starts) else None
 
@@ -226,7 +226,7 @@ class McapFile(StorageFile):
             position += PREFIX.size + length
 
     def _read_summary(self):
-        """Take channels, counts and places of chunks from the summary, when the file has one."""
+        """Read channels, counts and positions of chunks from the summary, when the file has one."""
         footer = self._read(max(self.size - FOOTER_SIZE - len(MAGIC), 0), FOOTER_SIZE + len(MAGIC))
         if len(footer) < FOOTER_SIZE + len(MAGIC) or footer[FOOTER_SIZE:] != MAGIC or footer[0] != FOOTER:
             return

@@ -1,4 +1,4 @@
-"""MCAP records (mcap.dev/spec): taking them apart, and finding the messages of a chunk without stepping through them."""
+"""MCAP records (mcap.dev/spec): parsing, and location of the messages of a chunk without stepping through them."""
 
 import struct
 import zlib
@@ -21,7 +21,7 @@ MESSAGE_PREFIX = PREFIX.size + 22
 MOST_OTHERS = 1 << 17
 """Records that are not messages in one buffer; there are at most 65,536 schemas and as many channels."""
 RUN = 8
-"""After so many records of one size, the next ones are looked for by stride."""
+"""After so many records of one size, the next ones are searched by stride."""
 
 
 class Schema(NamedTuple):
@@ -58,7 +58,7 @@ class Messages(NamedTuple):
 
 
 class McapDamage(Exception):
-    """A record that cannot be as the format says."""
+    """A record that violates the format."""
 
 
 def parse_schema(content: bytes | memoryview) -> tuple[int, Schema]:
@@ -97,7 +97,7 @@ def unpack_chunk(content: memoryview, decompress: Callable) -> tuple[bytes | mem
     content : buffer
         Content of the Chunk record, perhaps cut off.
     decompress : callable
-        (compression, bytes, size) -> at most that many bytes; gives what can be had of a stream that is cut off.
+        (compression, bytes, size) -> at most that many bytes; gives the readable part of a truncated stream.
 
     Returns
     -------
@@ -148,7 +148,7 @@ def indexed_messages(buffer: np.ndarray, indexes: Sequence[tuple[float, np.ndarr
 
 def walk(buffer: np.ndarray) -> tuple[Messages, list[tuple[int, bytes]], int]:
     """
-    Step through records until a chunk, the end, or an incomplete or impossible one; runs of one size are taken at once.
+    Step through records until a chunk, the end, or an incomplete or impossible one; runs of one size are parsed at once.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def log_times(buffer: np.ndarray, messages: Messages, index: np.ndarray) -> np.n
 
 
 def is_record(opcode: int) -> bool:
-    """Return whether the format knows the opcode, or leaves it to applications."""
+    """Return whether the format defines the opcode, or reserves it for applications."""
     return 1 <= opcode <= LAST_OPCODE or opcode >= 0x80
 
 

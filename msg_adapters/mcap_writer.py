@@ -14,7 +14,7 @@ MAGIC = b'\x89MCAP0\r\n'
 CHUNK_SIZE = 1 << 20
 MESSAGE_HEADER = np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
                            ('log_ns', '<u8'), ('publish_ns', '<u8')])
-"""Everything in front of the data of a Message record, 31 bytes."""
+"""Prefix of the data of a Message record, 31 bytes."""
 
 
 def text(value: bytes | str) -> bytes:

@@ -15,7 +15,7 @@ _END = object()
 
 def read_ahead(pieces: Generator[T, None, None]) -> Generator[T, None, None]:
     """
-    Run a generator in a thread and yield what it yields, in order; its exceptions are raised here.
+    Run a generator in a thread and yield its items in order; its exceptions are raised here.
 
     The thread ends with the generator, or soon after the consumer has closed this one.
     """

@@ -1,4 +1,4 @@
-"""ROS 1 bags as far as rosbags reads them, one raw message at a time."""
+"""ROS 1 bags, read by rosbags one raw message at a time."""
 
 import bz2
 from collections import defaultdict
@@ -47,7 +47,7 @@ class Ros1File:
         return max(self.reader.end_time - self.reader.start_time - 1, 0) if self.reader.message_count else 0
 
     def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Packed]]:
-        """Yield dicts topic -> Arrived in file order; what the file loses is counted in `lost`."""
+        """Yield dicts topic -> Arrived in file order; lost messages of the file are counted in `lost`."""
         connections = [c for c in self.reader.connections if self.topics[c.id] in topics]
         pending, n_pending, n_read = defaultdict(list), 0, 0
         expected = sum(c.msgcount for c in connections)
@@ -57,7 +57,7 @@ class Ros1File:
                 connection, received_ns, data = next(messages)
             except StopIteration:
                 break
-            except Exception as error:   # whatever a damaged file makes rosbags raise
+            except Exception as error:   # rosbags raises various errors on damaged files
                 self.lost[f'messages after damage ({error})'] = max(expected - n_read, 1)
                 break
             pending[self.topics[connection.id]].append((bytes(data), received_ns))

@@ -32,7 +32,7 @@ class Rosbag2:
     Raises
     ------
     ValueError, OSError, sqlite3.Error
-        When nothing of it can be read.
+        When no file of it can be read.
 
     """
 
@@ -65,7 +65,7 @@ class Rosbag2:
 
     @property
     def lost(self) -> dict[str, int]:
-        """What could not be read, reason -> count."""
+        """Unreadable data, reason -> count."""
         lost = dict(self._lost)
         for file in self.files:
             lost.update(file.lost)
@@ -73,7 +73,7 @@ class Rosbag2:
 
     @property
     def storage(self) -> str:
-        """What rosbag2 calls the storage of the first file."""
+        """Name in rosbag2 of the storage of the first file."""
         return next(storage.identifier for storage in STORAGES if isinstance(self.files[0], storage.reader))
 
     def definition(self, topic: str) -> TypeDefinition:
@@ -86,7 +86,7 @@ class Rosbag2:
         return TypeDefinition(message_type, encoding if text else '', text, digest)
 
     def qos(self, topic: str) -> list:
-        """Return the QoS profiles of a topic's publishers as far as the metadata say."""
+        """Return the QoS profiles of a topic's publishers that the metadata contain."""
         return spelled_out(self._entry(topic).get('offered_qos_profiles', []))
 
     def stretches(self, topics: Sequence[str]) -> Iterator:
@@ -98,7 +98,7 @@ class Rosbag2:
         return self._through(topics, lambda file: file.raw_stretches(topics), lambda raw: len(raw.topic))
 
     def _through(self, topics, read, count):
-        """Read the files one after the other; count what the metadata announce and damaged files do not hold."""
+        """Read the files one after the other; count the messages in the metadata that damaged files lack."""
         n_read = 0
         for file in self.files:
             file.lost.clear()
@@ -106,7 +106,7 @@ class Rosbag2:
                 for stretch in read(file):
                     n_read += count(stretch)
                     yield stretch
-            except Exception as error:   # whatever hostile or damaged files make the readers raise
+            except Exception as error:   # readers raise various errors on hostile or damaged files
                 file.lost[f'rest of {file.path.name} after damage ({shortened(f"{type(error).__name__}: {error}", 100)})'] = 1
         announced = sum(self._announced().get(topic, 0) for topic in topics)
         if self.lost and announced > n_read:
@@ -117,7 +117,7 @@ class Rosbag2:
         return next((entry for entry in entries if entry['name'] == topic), {})
 
     def close(self) -> None:
-        """Close the files and remove what was decompressed."""
+        """Close the files and remove decompressed copies."""
         for file in self.files:
             file.close()
         if self.folder:
@@ -142,7 +142,7 @@ class Rosbag2:
             plain = self._decompressed(path) if path.suffix in COMPRESSED else path
             self.files.append(reader(plain, unpack))
             self._lost.update(self.files[-1].lost)
-        except Exception as error:   # sqlite3, struct, OS and decompression errors: a damaged file must not cost the others
+        except Exception as error:   # sqlite3, struct, OS and decompression errors: a damaged file must not prevent reading of intact ones
             self._lost[f'file {path.name} that cannot be read ({error})'] = 1
             return f'{path.name}: {error}'
         return None
@@ -189,5 +189,5 @@ def _storage_suffix(path):
 
 
 def _natural(path):
-    """Sort key that puts bag_10 behind bag_9."""
+    """Sort key that places bag_10 after bag_9."""
     return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]

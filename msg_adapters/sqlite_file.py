@@ -129,7 +129,7 @@ class SqliteFile(StorageFile):
         return found[0]
 
     def _pack(self, rows, index):
-        """Return the data of some rows; what goes on in overflow pages is fetched by SQL and put behind the pages."""
+        """Return the data of some rows; data that continue in overflow pages are read by SQL and appended to the pages."""
         start, size = rows.start[index], rows.size[index]
         outside = np.flatnonzero(~rows.inside[index])
         if not len(outside):
@@ -178,7 +178,7 @@ def _connect(path, logged):
         raise sqlite3.DatabaseError('the file is shorter than one page')
     address = f'file:{quote(str(path))}?mode=ro' + ('' if logged else '&immutable=1')
     connection = sqlite3.connect(address, uri=True, check_same_thread=False)
-    # Without this SQLite refuses a truncated file as a whole; what is still there can then be read.
+    # Without this SQLite refuses a truncated file; with it the remaining rows can be read.
     connection.execute('PRAGMA writable_schema = ON')
     connection.text_factory = partial(str, encoding='utf-8', errors='replace')
     return connection

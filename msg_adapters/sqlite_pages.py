@@ -24,7 +24,7 @@ _INTEGER_SIZE = np.array([0, 1, 2, 3, 4, 6, 8, 8, 0, 0, 0, 0], dtype=np.int64)
 
 
 MARGIN = 64
-"""Zeros behind the pages, so that six varints never reach behind the buffer."""
+"""Zeros after the pages, so that six varints never exceed the buffer."""
 
 
 class MessageRows(NamedTuple):
@@ -41,7 +41,7 @@ class MessageRows(NamedTuple):
     size: np.ndarray
     """Bytes of the data, int64, shape (n,)."""
     inside: np.ndarray
-    """False where the data go on in overflow pages, bool, shape (n,)."""
+    """False where the data continue in overflow pages, bool, shape (n,)."""
     received_at: np.ndarray
     """First byte of the receive time in `buffer`, int64, shape (n,)."""
     received_type: np.ndarray
@@ -56,8 +56,8 @@ class PageReader:
     """
     Reads the leaves below one root page in the order of the row ids.
 
-    When inner pages are damaged or the file is cut off, all leaves of the file are read in their order instead: the inner page
-    above the first rows of a table often lies far behind them.
+    When inner pages are damaged or the file is truncated, all leaves of the file are read in their order instead: the inner page
+    above the first rows of a table is often much later in the file.
     """
 
     def __init__(self, path: Path, root: int):
@@ -96,7 +96,7 @@ class PageReader:
             yield self._read(np.concatenate(waiting))
 
     def rows(self, buffer: np.ndarray, starts: np.ndarray) -> MessageRows:
-        """Parse the leaves of a stretch; pages and rows that make no sense are counted and left out."""
+        """Parse the leaves of a stretch; invalid pages and rows are counted and omitted."""
         whole = buffer[starts] == LEAF
         if not self.scanning:
             self.damaged_pages += int((~whole).sum())
@@ -116,7 +116,7 @@ class PageReader:
         return rows if sensible.all() else MessageRows(buffer, *(column[sensible] for column in rows[1:]))
 
     def _ascending(self, row_id, sensible):
-        """Return where the row ids go on behind the largest one before."""
+        """Return where the row ids exceed the largest earlier one."""
         lowest = np.iinfo(np.int64).min
         ids = np.where(sensible, row_id, lowest)
         before = np.maximum.accumulate(np.concatenate([[lowest if self.last_id is None else self.last_id], ids]))
@@ -129,7 +129,7 @@ class PageReader:
         yield from self._leaf_groups(np.array([self.root]), 0)
 
     def _leaf_groups(self, pages, depth):
-        """Yield arrays of leaf page numbers below `pages`, all of one level; a page that several others or itself list counts once."""
+        """Yield arrays of leaf page numbers below `pages`, all of one level; a page listed several times, or by itself, counts once."""
         inside = pages[(pages >= 1) & (pages <= self.n_pages)]
         inside = inside[~self.is_seen[inside]]
         inside = inside[np.sort(np.unique(inside, return_index=True)[1])]
@@ -163,7 +163,7 @@ class PageReader:
         return word[np.append(pointers, 8)].astype(np.int64)
 
     def _read(self, pages):
-        """Read pages: in one piece where they lie close together, else run by run."""
+        """Read pages: in one piece where they are close together, otherwise run by run."""
         if np.ptp(pages) < 2 * len(pages) + 16:
             runs = [(pages.min(), pages.max() + 1)]
         else:
@@ -214,7 +214,7 @@ def _parse_cells(buffer, cell, page_end, largest):
 
 
 def _varint(buffer, position):
-    """Decode SQLite varints at `position`; return (value, position behind)."""
+    """Decode SQLite varints at `position`; return (value, position after it)."""
     byte = buffer[position]
     value, position = byte.astype(np.int64), position + 1
     if byte.max(initial=0) < 0x80:

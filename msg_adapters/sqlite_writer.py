@@ -20,11 +20,11 @@ SCHEMA = (
 
 
 class SqliteWriter:
-    """Writes one new file; nothing else may open it before `close`."""
+    """Writes one new file, which must not be opened elsewhere before `close`."""
 
     def __init__(self, path: Path, ros_distro: str):
         self.connection = sqlite3.connect(path, isolation_level=None)
-        # The file is made under another name and thrown away on failure: a journal would protect nothing.
+        # The file is made under another name and deleted on failure: a journal would have no benefit.
         for pragma in ('journal_mode = OFF', 'synchronous = OFF', 'locking_mode = EXCLUSIVE', 'cache_size = -16000'):
             self.connection.execute('PRAGMA ' + pragma)
         self.connection.execute('BEGIN')

@@ -13,19 +13,19 @@ ENCAPSULATION_SIZE = 4
 """CDR aligns relative to the byte after the encapsulation header."""
 
 FRAME_OFFSET = ENCAPSULATION_SIZE + 8
-"""Where the length of the frame_id stands, behind the stamp."""
+"""Position of the length of the frame_id, after the stamp."""
 
 LONGEST_NAME = 256
 """Bytes of a name; ROS 2 itself allows 255 for a topic."""
 LONGEST_FRAME = 4096
-"""Bytes of a frame_id in a message that is used; comparing frames takes time with the square of their length."""
+"""Bytes of a frame_id in a message that is used; the time to compare frames grows with the square of their length."""
 
 _STARTS = {order: struct.Struct(order + 'iII') for order in '<>'}
 _BYTE_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
 
 
 class MessageError(ValueError):
-    """A serialized message does not have the layout that its type asks for."""
+    """A serialized message does not have the layout of its type."""
 
 
 class UnusableMessage(MessageError):
@@ -55,7 +55,7 @@ def clean_name(name: str | bytes) -> str:
 
 
 class Header(NamedTuple):
-    """What stands in front of every stamped message."""
+    """Header of every stamped message."""
 
     order: str
     """Byte order of the message, '<' or '>'."""
@@ -64,7 +64,7 @@ class Header(NamedTuple):
     frame: bytes
     """frame_id without its closing zero."""
     end: int
-    """First byte behind the frame_id, not yet aligned."""
+    """First byte after the frame_id, not yet aligned."""
 
     @property
     def frame_id(self) -> str:
@@ -102,7 +102,7 @@ def from_ns(stamp_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def header_stamp_ns(message: Any) -> int:
-    """Return the header stamp of a message object, from rclpy or from rosbags (ROS 1 messages say nsec)."""
+    """Return the header stamp of a message object, from rclpy or from rosbags (ROS 1 messages have nsec)."""
     stamp = message.header.stamp
     stamp_ns = to_ns(int(stamp.sec), int(stamp.nanosec))
     if abs(stamp_ns) >= 2**63:

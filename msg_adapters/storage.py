@@ -1,4 +1,4 @@
-"""What the readers of storage files have in common: from stretches of rows to messages by topic."""
+"""Common part of the readers of storage files: from stretches of rows to messages by topic."""
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -30,14 +30,14 @@ class Arrived(NamedTuple):
     packed: Packed
     """The messages."""
     received_ns: Callable
-    """Called without arguments: receive times, int64, shape (n,); hardly anybody needs them."""
+    """Called without arguments: receive times, int64, shape (n,); rarely needed."""
 
 
 class RawMessages(NamedTuple):
     """Consecutive messages of some topics, in file order."""
 
     topic: np.ndarray
-    """Index into the topics that were asked for, shape (n,)."""
+    """Index into the requested topics, shape (n,)."""
     received_ns: np.ndarray
     """Receive times, int64, shape (n,)."""
     packed: Packed
@@ -61,7 +61,7 @@ class StorageFile:
         raise NotImplementedError
 
     def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Arrived]]:
-        """Yield dicts topic -> Arrived in file order; what the file loses is counted in `lost`."""
+        """Yield dicts topic -> Arrived in file order; lost messages of the file are counted in `lost`."""
         for stretch in self._stretches(topics):
             found = {}
             for topic in topics:
@@ -102,7 +102,7 @@ class StorageFile:
             return self._lose(f'messages that expand beyond {LARGEST_STRETCH} bytes', 1)
         try:
             return self.unpack(data)
-        except Exception as error:   # whatever the decompressor raises on damaged data
+        except Exception as error:   # decompressors raise various errors on damaged data
             return self._lose(f'messages that cannot be decompressed ({error})', 1)
 
     def _lose(self, what, count):

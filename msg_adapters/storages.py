@@ -14,7 +14,7 @@ from msg_adapters.storage import Arrived, RawMessages
 
 
 class BagSource(Protocol):
-    """The messages of one recording, whatever files they are in: `rosbag2.Rosbag2` or `ros1_file.Ros1File`."""
+    """The messages of one recording, independent of its file format: `rosbag2.Rosbag2` or `ros1_file.Ros1File`."""
 
     ros1: bool
     """Whether the messages are serialized as in ROS 1."""
@@ -23,11 +23,11 @@ class BagSource(Protocol):
     definitions: dict[str, tuple[str, str]]
     """Message type -> (encoding, text) of its definition."""
     counts: dict[str, int]
-    """Topic -> messages that the recording says it holds."""
+    """Topic -> number of messages by the recording's metadata."""
 
     @property
     def lost(self) -> dict[str, int]:
-        """What could not be read, reason -> count."""
+        """Unreadable data, reason -> count."""
 
     @property
     def duration_ns(self) -> int:
@@ -90,11 +90,11 @@ class Storage(NamedTuple):
     """One kind of storage file."""
 
     identifier: str
-    """What rosbag2 calls it."""
+    """Name in rosbag2."""
     suffix: str
     """How its files end."""
     reader: type[StorageReader]
-    """Opens (path, what unpacks each message, or None) for reading."""
+    """Opens (path, decompressor of each message, or None) for reading."""
     writer: Callable[..., StorageWriter]
     """Makes (path, ROS distribution, options by name)."""
 
@@ -103,7 +103,7 @@ STORAGES = [Storage('sqlite3', '.db3', SqliteFile, SqliteWriter), Storage('mcap'
 
 
 def identifiers() -> list[str]:
-    """Return what rosbag2 calls the storages."""
+    """Return the names of the storages in rosbag2."""
     return [storage.identifier for storage in STORAGES]
 
 

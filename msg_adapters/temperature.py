@@ -34,6 +34,6 @@ def temperature_row(message: Any) -> tuple[int, float]:
 
 
 def temperature_from_rows(rows: Sequence[tuple[float, float]]) -> TemperatureSamples:
-    """Return TemperatureSamples from what `temperature_row` gave."""
+    """Return TemperatureSamples from rows of `temperature_row`."""
     stamp_ns, temperature_c = zip(*rows, strict=True)
     return TemperatureSamples(np.array(stamp_ns, dtype=np.int64), np.array(temperature_c, dtype=float))
