@@ -1,6 +1,6 @@
 """
-Which effects the evidence of a recording asks for, proven on windows held out.
+Selection of the effects that a recording supports, proven on held-out windows.
 
 In: windows, a table and a sensor model. Out: an `Investigation`: the effects named, with their evidence, and the extended model.
-Read `investigation` first; a diagnosis is the story told about it.
+Read `investigation` first; a diagnosis is its description.
 """

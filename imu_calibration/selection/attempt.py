@@ -1,4 +1,4 @@
-"""The recording reduced around a point of linearisation, the search on it, and the decision whether to linearise anew."""
+"""The recording reduced around a point of linearisation, the search on it, and the decision whether to relinearise."""
 
 from copy import copy
 from dataclasses import replace
@@ -24,9 +24,9 @@ from imu_calibration.selection.time_constant_bank import make_bank
 from imu_calibration.selection.trusted_band import in_trusted_band
 
 FASTEST = 2 * np.pi * 3.0
-"""Motions are taken to have this angular frequency when the curvature of a delay is judged, rad/s."""
+"""Assumed angular frequency of motions in the curvature of a delay, rad/s."""
 TOO_COARSE = 4.0
-"""Evidence that a curvature may make before the columns are taken anew, nats."""
+"""Evidence of a curvature above which the columns are relinearised, nats."""
 BILINEAR = 2e-3
 """Relative change of the matrix that an effect left out may have caused."""
 
@@ -41,21 +41,21 @@ class Attempt:
         Of one recording, without clipped samples.
     table : Table
     baseline : SensorModel
-        The model that is asked what it lacks.
+        The model to be extended.
     effects : sequence of Effect
-        That are asked about.
+        Candidate effects.
     point : (SensorModel, array), optional
-        Where the columns are taken; at the baseline's own solution where not given.
+        Point of linearisation; default: the baseline's solution.
     locked : array, shape (k,)
-        Which windows are kept for the gain: columns are taken there too, but noise, fits and choices know nothing of them.
+        Mask of the windows reserved for the gain: they have columns, but are excluded from noise, fits and choices.
     bias_processes : dict, optional
-        Sensor -> how its bias moves, where that was measured apart.
+        Sensor -> its bias processes, where measured separately.
     progress : callable, optional
         Called with the share that is done.
     any_size : bool
-        Whether sizes that are known of no instrument are asked about.
+        Whether sizes above those of any known instrument are allowed.
     resolved : set of str
-        Effects that were judged beside one another already, as for `Search`.
+        Effects that were compared with each other already, as for `Search`.
 
     """
 
@@ -95,11 +95,11 @@ class Attempt:
 
     @cached_property
     def locked_samples(self) -> ParameterSpace:
-        """The locked windows, all samples compared: for the gain alone."""
+        """The locked windows, with all samples: for the gain only."""
         return replace(self.all_samples, recording=self.recording.select(self.locked))
 
     def values(self, chosen: Sequence[Question]) -> np.ndarray:
-        """Return the parameters of the whole space for a choice, fitted to the windows that choose, baseline in full, shape (q,)."""
+        """Return all parameters of the space for a choice, fitted to the selection windows, with all of the baseline, shape (q,)."""
         used = self.search.used(chosen)
         values = np.zeros(self.space.size)
         values[list(used)] = self.evidence.fit(used)[0]
@@ -108,11 +108,11 @@ class Attempt:
         return values
 
     def needs_another(self, chosen: Sequence[Question]) -> bool:
-        """Return whether the linearisation is too coarse for what was chosen: curvature times evidence."""
+        """Return whether the linearisation is too coarse for the choice: curvature times evidence."""
         return any('@' in question.label or self.curvature_shows(chosen, question) > TOO_COARSE for question in chosen)
 
     def curvature_shows(self, chosen: Sequence[Question], question: Question) -> float:
-        """Return what the evidence makes of an effect's curvature, nats: how well it is told from its own first derivative."""
+        """Return the evidence of an effect's curvature, nats: its separability from its first derivative."""
         without = self.search.used([q for q in chosen if q is not question])
         weight = self.evidence.loss(without) - self.evidence.loss(self.search.used(chosen))
         return weight * _curvature(question, self.values(chosen), self.recording.model, self.constants[-1] / 2)**2
@@ -131,13 +131,13 @@ class Attempt:
         return agree(fits, self.evidence.fit(used), at)
 
     def windows_agree(self, chosen: Sequence[Question], question: Question) -> bool:
-        """Return whether an effect stands out of what the windows disagree on it too (`WindowEvidence.p_value_by_scatter`)."""
+        """Return whether an effect is also significant against its scatter over windows (`WindowEvidence.p_value_by_scatter`)."""
         p_value = self.evidence.p_value_by_scatter(self.search.used(chosen), question.parameters)
         return p_value * len(self.questions) < FAMILY_WISE
 
     @cached_property
     def _halves(self):
-        """Normal matrices of the windows before and after the middle of those that choose."""
+        """Normal matrices of the first and second half of the selection windows."""
         judged = self.evidence.space
         early = np.arange(len(judged.recording.windows)) < len(judged.recording.windows) // 2
         return [normal_matrix(judged, self.noise, half) for half in (early, ~early)]
@@ -150,13 +150,13 @@ class Attempt:
         return {self.space.names[k]: float(change) for k, change in zip(smaller, moved)}
 
     def acts_beside(self, chosen: Sequence[Question]) -> bool:
-        """Return whether the columns were taken with a lag, delay or error of the table that is not among the chosen effects."""
+        """Return whether the point of linearisation has a lag, delay or error of the table that is not among the chosen effects."""
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
         model = self.recording.model
         return any(e.warp is not None and e.key not in kept and np.any(model.point_of(e)) for e in model.effects)
 
     def point(self, chosen: Sequence[Question]) -> tuple[SensorModel, np.ndarray]:
-        """Return (model, values) at which the columns should be taken for this choice."""
+        """Return the point of linearisation (model, values) for this choice."""
         values = self.values(chosen)
         model = extended_model(self.baseline, self.effects)
         for question in chosen:
@@ -180,7 +180,7 @@ class Attempt:
         return model.at(start), start
 
     def _warm_up(self, chosen, question, values):
-        """Return amplitudes and time constant of a warm-up, the latter between those of the bank."""
+        """Return amplitudes and time constant of a warm-up, interpolated in the bank."""
         number = int(question.label.split('@')[1])
         place = chosen.index(question)
         near = [k for k in (number - 1, number, number + 1) if 0 <= k < len(self.constants)]

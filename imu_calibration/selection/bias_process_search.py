@@ -1,4 +1,4 @@
-"""The likeliest offsets and bias process of a sensor beside some of the effects that are asked about."""
+"""The likeliest offsets and bias process of a sensor, given some of the candidate effects."""
 
 from typing import Callable, Sequence
 
@@ -9,9 +9,9 @@ from imu_calibration.estimation.noise_search import FLICKER, NoiseLikelihood
 TIMES = (100.0, 300.0, 15.0, 40.0, 1000.0, FLICKER)
 """Correlation times that are tried, s, and flicker; that of the natural process first."""
 NATURAL = 0.5
-"""Every bias is taken to move by at least this many times the white noise of one second, with the first of these correlation times."""
+"""Least sd of every bias process over the white noise of one second, with the first of these correlation times."""
 SPREAD = 0.8
-"""Standard deviation of the logarithm of how much more than naturally biases move: what is far beyond it is hardly a wander."""
+"""Prior sd of the logarithm of a bias process's sd over the natural one; much larger drifts are hardly a bias process."""
 OFFSETS = 10.0
 """Price of offsets of windows: they are no noise of a sensor, and flicker scatters means of windows beyond a wander of 15 s as they do."""
 RATIOS = (0.0, *2.0 ** np.arange(-2.0, 8.5, 0.5))
@@ -22,7 +22,7 @@ Standard deviations that are tried, in units of the typical noise of a window me
 
 class BiasProcessSearch:
     """
-    The best shape of the noise ``(offset sd, sd of the bias process, its correlation time)`` beside a choice of parameters.
+    The best shape of the noise ``(offset sd, sd of the bias process, its correlation time)`` given a choice of parameters.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class BiasProcessSearch:
         self.likelihood, self.least, self.usual = likelihood, least / likelihood.typical, max(least, usual) / likelihood.typical
 
     def best(self, used: Sequence[int]) -> tuple[tuple, float]:
-        """Return (shape, loss) of the best noise beside the parameters `used`, standard deviations in units of the typical noise."""
+        """Return (shape, loss) of the best noise given the parameters `used`, standard deviations in units of the typical noise."""
         def loss(shape):
             return self.likelihood.loss(shape, used) + self.price(*shape[:2])
 
@@ -53,11 +53,11 @@ class BiasProcessSearch:
         return shape, loss(shape)
 
     def price(self, offset: float, bias: float) -> float:
-        """Return minus twice the log of what is believed of offsets, beside none, and of the sd of a bias, beside the usual one."""
+        """Return minus twice the log prior of offsets, relative to none, and of the sd of a bias, relative to the usual one."""
         return OFFSETS * (offset > 0) + ((np.log(max(bias / self.usual, 1.0)) / SPREAD)**2 if self.least else 0.0)
 
     def of_middle_axis(self, shape: tuple, used: Sequence[int]) -> float:
-        """Return the median over the axes of the likeliest sd of the bias process of each, the others moving as the shape says."""
+        """Return the median over the axes of the likeliest sd of the bias process of each, with `shape` for the other axes."""
         def likeliest(own):
             offset = shape[0] * self.likelihood.typical / own.typical
             return own.typical * _descend(lambda x: own.loss((offset, x, shape[2]), used), RATIOS)

@@ -1,4 +1,4 @@
-"""Windows without what a limit of the output spoils, before anything is asked of them; the locked ones show no limit."""
+"""Removal of windows corrupted by clipped output before the search; limits are estimated without the locked windows."""
 
 from collections.abc import Sequence
 
@@ -28,7 +28,7 @@ def windows_at(windows: Sequence[Window], rows: np.ndarray) -> list[Window]:
 
 def without_clipping(windows: list[Window], table: Table, model: SensorModel) -> tuple[list[Window], np.ndarray, list[Saturation]]:
     """
-    Return (windows without samples that a limit spoils, which of them are locked, the limits that the others show).
+    Return (windows without samples corrupted by a limit, mask of the locked ones, limits estimated from all other windows).
 
     One fast swing may be all that reaches a limit: a window in which outputs pile up is not locked, where they do so at a limit.
     """
@@ -57,7 +57,7 @@ def _piled(windows):
 
 
 def _limits(windows, table, model):
-    """Return (limits found, standard deviation of single samples by sensor, parameters of a simple fit without what the limits spoil)."""
+    """Return (limits found, standard deviation of single samples by sensor, parameters of a simple fit without corrupted samples)."""
     nothing = [], {}, None
     suspects = [sensor for sensor in SENSORS if may_be_clipped(windows, sensor)]
     if not suspects:
@@ -69,7 +69,7 @@ def _limits(windows, table, model):
         predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))
         kept = without_clipped(windows, predicted, limits, noise_sd=noise_sd)
         if len(kept) < LEAST_WINDOWS:
-            return nothing   # what is always at its limit, or always near it, shows no limit
+            return nothing   # output that is always at or near its limit does not determine it
     values = simple_fit(kept, table, model)
     predicted = predictions(windows, table, model, values=values)
     found = [limit for limit in (find_saturation(windows, predicted, noise_sd[sensor], sensor=sensor) for sensor in suspects) if limit]

@@ -16,17 +16,17 @@ from imu_calibration.selection.normal_matrices import white_means, within_of_axi
 from imu_calibration.selection.parameter_space import ParameterSpace
 
 LEAST_WINDOWS = 8
-"""Fewer windows leave none to hold out."""
+"""Least number of windows for held-out folds."""
 FOLDS = 6
 """Parts that are held out in turn."""
 LEAST_SCATTER = 20
-"""Windows more than parameters from which on their scatter says something of its own."""
+"""Least excess of windows over parameters for a test with their scatter."""
 LOCKED_EVERY = 4
-"""Every so many windows of each kind are locked away: nothing is estimated, chosen or refused on them."""
+"""One of this many windows of each kind is locked: excluded from estimation, selection and rejection."""
 
 
 def locked_windows(kind: np.ndarray) -> np.ndarray:
-    """Return a mask of the windows that are looked at once, for the gain: every fourth of each kind, spread through the session."""
+    """Return the mask of the windows that are used only for the gain: every fourth of each kind, spread through the session."""
     return _turn_of(kind, LOCKED_EVERY) == LOCKED_EVERY - 2
 
 
@@ -44,14 +44,14 @@ def _turn_of(kind, modulus):
 
 class Evidence(ABC):
     """
-    What a search asks about choices of parameters, each a sequence of indices.
+    Evidence for choices of parameters, each a sequence of indices.
 
     Losses are minus twice log likelihoods, up to a constant.
 
     Parameters
     ----------
     prior_sd, prior_mean : array, shape (q,)
-        What is known of the parameters before.
+        Prior of the parameters.
 
     """
 
@@ -63,7 +63,7 @@ class Evidence(ABC):
 
     @abstractmethod
     def normal(self, number: int | None = None) -> np.ndarray:
-        """Return the normal matrix of everything that may be chosen from, or of all but fold `number`, shape (q + 1, q + 1)."""
+        """Return the normal matrix of all folds, or of all but fold `number`, shape (q + 1, q + 1)."""
 
     @abstractmethod
     def loss(self, used: Sequence[int]) -> float:
@@ -82,7 +82,7 @@ class Evidence(ABC):
         raise NotImplementedError(f'{type(self).__name__} has no effect that acts on both sensors')
 
     def fit(self, used: Sequence[int], number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return (values, covariance) of the parameters `used`, fitted to everything or to all but fold `number`."""
+        """Return (values, covariance) of the parameters `used`, fitted to all folds or to all but fold `number`."""
         ordered = tuple(sorted(used))
         if (ordered, number) not in self._fits:
             self._fits[ordered, number] = solve_normal(self.normal(number), np.array(ordered), **self._prior)
@@ -95,7 +95,7 @@ class Evidence(ABC):
 
 class WindowEvidence(Evidence):
     """
-    Evidence of the windows of a reduced recording, whose noise is known.
+    Evidence of the windows of a reduced recording with known noise.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class WindowEvidence(Evidence):
     fold : array, shape (k,)
         Fold of each window.
     scatter : dict, optional
-        Sensor -> by how many times each window scatters more within than others of its kind, at least 1, shape (k, 3); its mean does too.
+        Sensor -> factor of the scatter within (and of the mean) of each window over its kind, at least 1, shape (k, 3).
 
     """
 
@@ -130,7 +130,7 @@ class WindowEvidence(Evidence):
         return found
 
     def known_from(self, sensor: str, used: Sequence[int]) -> np.ndarray:
-        """Return the covariance that one sensor alone, and what is known before, leave the parameters `used`."""
+        """Return the covariance of the parameters `used` from one sensor and the prior."""
         at = np.ix_(used, used)
         information = self._of_sensor(sensor).sum(axis=0)[at]
         return inverse_normal(information + np.diag(1 / self._prior['prior_sd'][list(used)]**2))
@@ -140,7 +140,7 @@ class WindowEvidence(Evidence):
         return self.total if number is None else self.total - self._parts[number]
 
     def equations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (matrix, right side) of the normal equations of all parameters on all chosen windows, what is known before included."""
+        """Return (matrix, right side) of the normal equations of all parameters on all chosen windows, with the prior."""
         known = 1 / self._prior['prior_sd']**2
         return self.total[:-1, :-1] + np.diag(known), self.total[:-1, -1] + known * self._prior['prior_mean']
 
@@ -167,10 +167,10 @@ class WindowEvidence(Evidence):
 
     def unpredicted(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
-        Return the same, the means' in units of what each fold under the fit to the others may miss it by: as much as there are means.
+        Return the same loss; the means are in units of their prediction error by the fit to the other folds: their number is expected.
 
-        Of a bias that wanders slowly the first window says how large it is and all others how it goes on: without this the first is missed
-        by what the others do not know. What a drift does within windows, which tells nothing of it, is predicted too.
+        A slow bias process is correlated over folds: without this, the loss of a fold includes the uncertainty of the fit to
+        the other folds. The effect of a drift within windows, which does not determine it, is predicted too.
         """
         left, own, found = self._left_of_all(used), np.array(sorted(used)), self.heldout_parts(used)
         others = (self.total - self._parts)[:, own[:, None], own] + np.diag(1 / self._prior['prior_sd'][own]**2)
@@ -187,19 +187,19 @@ class WindowEvidence(Evidence):
 
     @cached_property
     def _within_whole(self):
-        """Sensor -> of each axis what is within the windows of each fold, with that of effects that are smooth in time."""
+        """Sensor -> part within the windows of each fold, for each axis, including effects that are smooth in time."""
         whole, folds = replace(self.space, join_within=self.space.join), [self.fold == number for number in range(self.fold.max() + 1)]
         return {sensor: [np.array([[within_of_axis(whole, self.noise[sensor], sensor, axis=axis, select=own) for own in folds]])
                          for axis in range(3)] for sensor in SENSORS}
 
     def _left_of_all(self, used):
-        """Return what turns rows of all parameters into residuals of the fit to all other folds, shape (k, q + 1)."""
+        """Return the vectors that map rows of all parameters to residuals of the fit to all other folds, shape (k, q + 1)."""
         left = np.zeros((len(self._parts), self.space.size + 1))
         left[:, np.append(sorted(used), -1)] = self._left_by_others(tuple(sorted(used)))
         return left
 
     def _left_by_others(self, used):
-        """Return for each fold what turns rows of `used`, sorted, into residuals of the fit to all other folds, shape (k, n + 1)."""
+        """Return for each fold the map from rows of `used`, sorted, to residuals of the fit to all other folds, shape (k, n + 1)."""
         if used not in self._predictions:
             at, known = np.array(used), 1 / self._prior['prior_sd'][list(used)]**2
             places = np.append(at, -1)
@@ -215,11 +215,11 @@ class WindowEvidence(Evidence):
 
     def p_value_by_scatter(self, used: Sequence[int], parameters: Sequence[int]) -> float:
         """
-        Return the p-value of some of the parameters `used`, by how far the windows agree on them (Hotelling's T^2); 0 where these are few.
+        Return the p-value of some of the parameters `used`, from their scatter over windows (Hotelling's T^2); 0 with few windows.
 
-        With the slopes ``g_k = A_k' V_k^-1 e_k`` of the windows beside the fit and its covariance C, the estimates scatter with
-        ``C sum(g_k g_k') C`` whatever the noise is like: within windows it is taken to be white and the same in all of a kind, while a bias
-        that wanders within them, and encoders where two joints turn fast, make it neither (White 1980, Econometrica 48).
+        With the slopes ``g_k = A_k' V_k^-1 e_k`` of the windows at the fit and its covariance C, the estimates have the covariance
+        ``C sum(g_k g_k') C`` for any noise. The model has white noise within windows, equal in all of a kind; a bias
+        process within them, and encoders where two joints turn fast, violate both (White 1980, Econometrica 48).
         """
         values, covariance = self.fit(used)
         reduced, slopes = self.space.reduced(used, values), np.zeros((len(self.fold), self.space.size + 1))
@@ -234,7 +234,7 @@ class WindowEvidence(Evidence):
         sd = np.sqrt(np.diag(covariance)[places])
         moved = slopes[:, list(used)] @ (covariance[:, places] / sd)
         sizes, directions = np.linalg.eigh(moved.T @ moved)
-        told = sizes > SURE * sizes[-1]   # compliances that no pose shows, arms that add up to nothing
+        told = sizes > SURE * sizes[-1]   # without unobservable directions: compliances in no pose, arms that cancel
         n_windows, n_own = len(moved), int(told.sum())
         if n_windows - n_own < LEAST_SCATTER:
             return 0.0
@@ -243,5 +243,5 @@ class WindowEvidence(Evidence):
 
 
 def _squares(parts, rows):
-    """Return sums of squares of what the normal matrices of folds, shape (p, f, n, n), and rows of residuals (f, n) leave, shape (p,)."""
+    """Return residual sums of squares from normal matrices of folds, shape (p, f, n, n), and residual vectors (f, n), shape (p,)."""
     return np.einsum('fi,pfij,fj->p', rows, parts, rows)

@@ -1,4 +1,4 @@
-"""Which share of what noise leaves unexplained the chosen effects remove, so that none is named beside a cause that nobody asked about."""
+"""Share of the excess over noise that the chosen effects remove; prevents findings that stand in for a cause outside the catalogue."""
 
 from typing import Callable, Sequence
 
@@ -16,19 +16,19 @@ LEAST_SHARE = 0.7
 LEAST_SHARE_SMOOTH = 0.9
 """The same for an effect that is smooth in time: any smooth curve resembles any other."""
 SHOWS = 0.2
-"""An effect shows where it removes at least this share of what it removes elsewhere."""
+"""An effect counts in a sensor or part where it removes at least this share of its largest removal."""
 SIGNIFICANT_REST = 5.0
-"""Standard deviations above what noise leaves from which a rest counts as significant."""
+"""Standard deviations above the expectation from noise from which an excess is significant."""
 ONE_OF_THREE = 6.0 / 5.0
-"""So many times that many are asked of one axis alone: there are three, and the fewer there are the more often squares are so large."""
+"""Factor on this limit for a single axis: the largest of three is tested, and fewer squares have heavier tails."""
 
 
 class Explained:
     """
-    What noise alone leaves, and what the chosen effects leave, in held-out windows.
+    Loss on held-out windows: the expectation from noise, and the loss of a choice of effects.
 
-    Noise alone has no offsets of windows, and the bias moves as it was found to, as far as biases do. What scatters more within than others
-    of its kind has a mean that is less certain: one turn about two fast axes among many slow ones.
+    The noise here has no window offsets, and the estimated bias process up to a plausible size. A window that scatters more within than
+    its kind has a less certain mean: one turn about two fast axes among many slow ones.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Explained:
         self.n_within = 3.0 * (recording.count - 1)[recording.moving].sum()
 
     def excess(self, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
-        """Return sensor -> excess of the means and within windows, of each axis: losses above what noise leaves, held out, shape (2, 3)."""
+        """Return sensor -> excess of each axis, of the means and within windows: held-out loss minus its expectation from noise, (2, 3)."""
         losses = self.floor.unpredicted(self.search.used(chosen))
         return {sensor: parts - self._numbers[:, None] / 3.0 for sensor, parts in losses.items()}
 
@@ -59,15 +59,15 @@ class Explained:
 
     def sigma(self, excess: np.ndarray) -> np.ndarray:
         """
-        Return the standard deviations by which the means, and what is within windows, exceed noise, shape (2,).
+        Return the excess over noise in standard deviations, of the means and within windows, shape (2,).
 
-        Of all axes together or of the one that does so most, which must do so more clearly: the quiet of the others hides what one has.
+        The larger one of all axes together and of the worst axis, with a stricter limit: two quiet axes dilute the excess of the third.
         """
         together, alone = self._sigmas(excess)
         return np.maximum(together, alone.max(axis=1))
 
     def _sigmas(self, excess):
-        """Return the same of all axes together, shape (2,), and of each alone, shape (2, 3)."""
+        """Return the same of all axes together, shape (2,), and of each axis, shape (2, 3)."""
         sd = np.sqrt(2 * np.maximum(self._numbers, 1.0))
         return excess.sum(axis=1) / sd, excess / (sd / np.sqrt(3.0) * ONE_OF_THREE)[:, None]
 
@@ -85,28 +85,28 @@ class Explained:
         """
         Return the least share of the unexplained that the effect removes, over the sensors in which it shows.
 
-        Of a sensor counts the part in which it shows, the means of windows, what is within them, or both: what nobody explains in the other
+        In each sensor only the parts with the effect count (means of windows, within windows, or both): an unexplained excess in the other
         part does not hide it.
         """
         return min((removed / (removed + rest) for removed, rest in self._where_it_shows(chosen, question)), default=0.0)
 
     def rest_beside(self, chosen: Sequence[Question], question: Question) -> float:
-        """Return what the choice leaves that noise does not explain, where the effect shows."""
+        """Return the excess over noise of the choice, in the parts where the effect shows."""
         return sum(rest for _, rest in self._where_it_shows(chosen, question))
 
     def _where_it_shows(self, chosen, question):
-        """Return (removed by the effect, significant rest beside it) of each sensor in which it shows, of the parts in which it does."""
+        """Return (removed by the effect, significant remaining excess) of each sensor, in the parts where the effect shows."""
         with_it, without = self.excess(chosen), self.excess([q for q in chosen if q is not question])
         removed = {s: (without[s] - with_it[s]).sum(axis=1) for s in sensors_of(question.effect)}
         strongest = max(parts.sum() for parts in removed.values())
-        # A cause of the table shows in both sensors; where it hardly shows it proves nothing.
+        # A cause in the table acts on both sensors; a sensor with a weak signal is no evidence.
         sensors = [s for s, parts in removed.items() if parts.sum() >= SHOWS * strongest > 0]
         shown = {s: removed[s] >= SHOWS * removed[s].max() for s in sensors}
         return [(float(removed[s][shown[s]].sum()), float(self._rest(with_it[s])[shown[s]].sum())) for s in sensors]
 
 
 def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:
-    """Return the choice without effects that remove too little, weakest first; `share(chosen, question)` says how much each removes."""
+    """Return the choice without effects that remove too little, weakest first; `share(chosen, question)` is the share that each removes."""
     chosen = list(chosen)
     while chosen:
         shares = [share(chosen, question) / needed_share(question) for question in chosen]

@@ -25,7 +25,7 @@ def extended_solution(space: ParameterSpace, noise: dict[str, NoiseModel], basel
     Parameters
     ----------
     space : ParameterSpace
-        Of a recording whose columns were taken at the point of the chosen effects.
+        Of a recording linearised at the chosen effects.
     noise : dict
         Sensor -> NoiseModel.
     baseline : SensorModel

@@ -1,4 +1,4 @@
-"""How much better the extended model predicts windows that it was not fitted to; the locked ones took no part in choosing it either."""
+"""Gain of the extended model in predicting held-out windows; the locked ones were also excluded from its selection."""
 
 from dataclasses import dataclass
 from typing import Sequence
@@ -9,14 +9,14 @@ from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.questions import Question
 
 RESAMPLES = 1000
-"""Of whole windows, for an interval."""
+"""Number of resamples of windows for an interval."""
 AT_REST = 'means of windows at rest'
 MEASURES = ('samples', 'window means', 'samples about the mean of their window', AT_REST)
-"""Residuals that a gain is told of."""
+"""Residuals of which a gain is reported."""
 LEAST_REDUCTION = 0.01
 """
-Where a rest stays unexplained, or nothing rests, a finding takes more than this share off the residual of windows held out in turn, for
-sure.
+With an unexplained excess, or without rests, a finding reduces the cross-validated residual by more than this share, with
+97.5 % confidence.
 """
 
 
@@ -25,7 +25,7 @@ class Gain:
     """Residual on windows that were held out, before and after."""
 
     sensor: str
-    """Sensor in whose unit the residuals are."""
+    """Sensor; the residuals have its unit."""
     measure: str
     """One of `MEASURES`, whichever shows the effect better in the windows that it was chosen on."""
     heldout_rms_before: float
@@ -33,13 +33,13 @@ class Gain:
     heldout_rms_after: float
     """The same with it."""
     ci95: tuple[float, float]
-    """95 % interval of the reduction, by resampling whole windows."""
+    """95 % interval of the reduction, by resampling windows."""
     windows: int
     """Windows that were held out."""
 
     @property
     def least(self) -> float:
-        """Lower end of the interval, minus infinity where too few windows tell it: a recording without rests says nothing of them."""
+        """Lower end of the interval, minus infinity with too few windows, e.g. for rests in a recording without any."""
         return -np.inf if np.isnan(self.ci95[0]) else self.ci95[0]
 
     @property
@@ -50,7 +50,7 @@ class Gain:
 
 def heldout_gain(attempt: Attempt, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
     """
-    Return the Gain of the choice `after` over the choice `before` on the locked windows, which nothing else looks at.
+    Return the Gain of the choice `after` over the choice `before` on the locked windows, which are used only here.
 
     Both are fitted to the windows that choose, and these choose sensor and measure too (`gain_in_turn`).
 
@@ -70,10 +70,10 @@ def heldout_gain(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
 
 def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
     """
-    Return the same Gain on the windows that choose, each fold under the fit to the others.
+    Return the same Gain on the selection windows by cross-validation.
 
-    Told is the measure that falls most, or where that is not sure, the one that falls most surely: a small lag takes a tenth off the window
-    means by chance, and half a percent off the samples for sure. Of a quiet sensor moving windows show the encoder, and rests the sensor.
+    Returned is the measure with the largest reduction; if that is uncertain, the one with the surest: a small lag may reduce window means
+    by a tenth through noise, and samples by a certain half percent. For a quiet sensor moving windows show the encoder, rests the sensor.
     """
     found, fold = [], attempt.evidence.fold
     for sensor in sensors:

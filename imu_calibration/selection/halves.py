@@ -7,28 +7,28 @@ import numpy as np
 from imu_calibration.chances import chi2_sf
 
 DISAGREE = 1e-4
-"""Chance that halves which agree are taken to disagree."""
+"""Significance level of the test that the halves differ."""
 APART = 1 / 16
 """
-Share of what an effect explains that is lost where both halves share one value, from which they disagree.
+Share of an effect's chi-square that is lost with one value for both halves, above which they disagree.
 
-With halves that know the same, values that differ by half of what the whole says.
+For halves of equal precision: values that differ by half of the joint estimate.
 """
 
 
 def agree(halves: Sequence[tuple[np.ndarray, np.ndarray]], whole: tuple[np.ndarray, np.ndarray], at: Sequence[int]) -> bool:
     """
-    Return whether halves show some parameters alike, as far as they show them.
+    Return whether the estimates of some parameters from two halves agree within their precision.
 
-    They disagree when what they say differs by more than chance, and when one value for both loses more than `APART` of what it explains.
-    A half that hardly shows an effect loses little, whatever its misfit makes of the value: before anything turns, an arm may be a metre.
+    They disagree when the difference is significant and one value for both loses more than `APART` of the chi-square.
+    A half that hardly determines an effect loses little, for any value: before any rotation, an arm may be estimated at a metre.
 
     Parameters
     ----------
     halves, whole
-        (values, covariance) of the same parameters, fitted to each half and to everything.
+        (values, covariance) of the same parameters, fitted to each half and to both.
     at : sequence of int
-        Places of the parameters that are asked about.
+        Indices of the parameters under test.
 
     """
     at = list(at)

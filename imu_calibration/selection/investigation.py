@@ -1,4 +1,4 @@
-"""The search from windows to named effects: clipped samples out, linearise, choose, prove, linearise anew."""
+"""The search from windows to named effects: remove clipped samples, linearise, choose, prove, relinearise."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -25,35 +25,35 @@ from imu_calibration.selection.search import Named, Search
 from imu_calibration.selection.simpler import simpler
 
 LINEARISATIONS = 5
-"""Times that the columns are taken anew, at most."""
+"""Largest number of linearisations."""
 EXPLANATIONS = 4
 """Explanations of the lags that are tried, at most."""
 LEFT = 0.1
-"""Share of a significant rest that pairs, or effects of implausible size, may leave."""
+"""Largest remaining share of a significant excess after pairs, or effects of implausible size."""
 
 
 @dataclass(frozen=True, eq=False)
 class Investigation(Named):
-    """What a search found, before it is put into words."""
+    """Numerical result of a search, without sentences."""
 
     used: list[Window]
     """Windows that were fitted to, without clipped samples."""
     attempt: Attempt
     """The last linearisation with its evidence."""
     explained: Explained
-    """What noise leaves and what the choices leave."""
+    """Expected loss from noise and losses of choices."""
     named: Sequence[Question]
     """Questions that became findings, in the order found."""
     limits: list[Saturation]
     """Saturations."""
     not_testable: list[dict]
-    """Effects that could not be asked about."""
+    """Effects that could not be tested."""
     denied: Sequence[Question] = field(default_factory=list)
     """Questions that would have become findings, but the parts of the recording disagree on them."""
     doubtful: Sequence[Question] = field(default_factory=list)
-    """Questions that likelihood asks for, but that are not named: they pay too little, or leave too much, to be sure of them."""
+    """Questions selected by likelihood but not named: their gain is too small, or the remaining excess too large."""
     rivals: Sequence[Rival] = field(default_factory=list)
-    """What would do nearly as well in the place of a finding."""
+    """Alternatives to findings that fit nearly as well."""
 
     @property
     def search(self) -> Search:
@@ -64,20 +64,20 @@ class Investigation(Named):
 def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
                 bias_processes: dict | None = None) -> Investigation:
     """
-    Ask every effect that a model lacks on held-out windows.
+    Test every effect that a model lacks on held-out windows.
 
     Parameters
     ----------
     windows : sequence of Window
-        One recording in order; windows of kind 'unused' take no part.
+        One recording in order; windows of kind 'unused' are excluded.
     table : Table
         The reference.
     model : SensorModel
-        The model that is asked what it lacks.
+        The model to be extended.
     progress : callable, optional
         Called with the share that is done, in [0, 1].
     bias_processes : dict, optional
-        Sensor -> how its bias moves, where that was measured apart.
+        Sensor -> its bias processes, where measured separately.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
 
 @dataclass(frozen=True, eq=False)
 class _Outcome:
-    """What became of a choice."""
+    """Result of a choice."""
 
     attempt: Attempt
     explained: Explained
@@ -127,7 +127,7 @@ class _Outcome:
 
     @cached_property
     def rest(self):
-        """What the findings leave in excess of noise, where it is significant."""
+        """Significant excess over noise with the findings in the model."""
         return sum(map(self.explained.rest, self.explained.excess(self.named).values()))
 
 
@@ -156,10 +156,10 @@ def _with_lags(explanations, attempted):
 
 def _looked_again(outcome, attempted, any_size):
     """
-    Return the _Outcome of what explains a significant rest that stays.
+    Return the _Outcome of the searches for the cause of a remaining significant excess.
 
-    Further searches start from pairs, or ask about implausible sizes too. Any two of many effects take something off a rest that has
-    another cause: together they must take nearly all.
+    Further searches start from pairs, or allow implausible sizes. Any two of many effects reduce an excess of
+    a different cause somewhat: together they must remove nearly all.
     """
     if not outcome.rest:
         return outcome
@@ -175,7 +175,7 @@ def _looked_again(outcome, attempted, any_size):
 
 
 def _settled(attempted, attempt, chosen, progress=None):
-    """Return the _Outcome of a choice: columns are taken where the effects are, then those stay that are sure to explain and to help."""
+    """Return the _Outcome of a choice: relinearise at the effects, then keep those with sufficient share and gain."""
     for _ in range(LINEARISATIONS - 1):
         if not attempt.needs_another(chosen):
             break
@@ -197,7 +197,7 @@ def _settled(attempted, attempt, chosen, progress=None):
 
 
 def _searched(attempt, chosen):
-    """Return what a search chooses at another linearisation; what was resolved before is where it starts."""
+    """Return what a search chooses at another linearisation; it starts from the resolved effects."""
     return attempt.search.run(_resolved(attempt, chosen))
 
 
@@ -213,7 +213,7 @@ def too_few_windows(count: int) -> NotObservableError:
 
 
 def _agreed(attempt, explained, named):
-    """Return (findings on which both halves of the recording agree and that stand without the others, those on which halves do not)."""
+    """Return (findings on which both halves agree and that hold without the other ones, findings on which the halves disagree)."""
     denied = [question for question in named if not attempt.agrees_in_halves(named, question)]
     kept = [question for question in named if question not in denied]
     return attempt.search.standing(_that_help(attempt, explained, kept) if denied else kept), denied
@@ -221,11 +221,11 @@ def _agreed(attempt, explained, named):
 
 def _that_help(attempt, explained, named):
     """
-    Return the findings that are possible and predict windows held out in turn better, one at a time the least helpful taken out.
+    Return the admissible findings that improve cross-validated prediction, by backward elimination of the least helpful.
 
-    Likelihood alone is not enough: without rests the noise is known from the misfit alone, and a misfit that repeats with the motion makes
-    evidence of anything that goes with it. So the plain residual, in the unit of the sensor, must fall too. The locked windows are not
-    asked: what they show afterwards could not be told as a gain.
+    Likelihood alone is not enough: without rests the noise is estimated from the misfit, and a misfit that repeats with the motion is
+    evidence for any effect that correlates with it. So the unweighted residual must decrease too. The locked windows are not
+    used: their later gain would be biased.
     """
     kept = [question for question in named if attempt.search.allowed(named, question) and attempt.windows_agree(named, question)]
     while kept:
@@ -239,16 +239,16 @@ def _that_help(attempt, explained, named):
 
 def _needed_reduction(attempt, explained, chosen, question):
     """
-    Return what the residual must fall by.
+    Return the required relative reduction of the residual.
 
-    At all, and plainly where misfit stays beside it that nobody explains, or where nothing tells it from noise.
+    Zero; `LEAST_REDUCTION` with an unexplained excess, or without rests to separate misfit from noise.
     """
     clear = not attempt.recording.moving.all() and not explained.rest_beside(chosen, question)
     return 0.0 if clear else LEAST_REDUCTION
 
 
 def _sure_reduction(attempt, chosen, question):
-    """Return the lower end of the interval of what an effect takes off the residual of windows held out in turn, in the sensor's unit."""
+    """Return the lower end of the interval of an effect's reduction of the cross-validated residual."""
     return gain_in_turn(attempt, [q for q in chosen if q is not question], chosen, sensors=sensors_of(question.effect)).ci95[0]
 
 

@@ -1,10 +1,10 @@
 """
-One explanation of the lags: what both sensors lag by, told as simply and as much in common as the recording allows.
+One explanation of the lags of both sensors, as simple and as common to both as the recording allows.
 
 A late clock, a delay of one sensor and its filters have the same first derivative, so a search meets them in any order, and halves of one
-recording told one lag under different names. Here every description that a sensor's lag may have is linearised where it is, both sensors'
-costs are added up, and of all explanations that come within the search's price of the best the simplest is told: fewest effects first,
-then a clock that both share before lags of their own, then a delay before a filter. The others are its rivals.
+recording may name one lag differently. Here every description of a sensor's lag is linearised at its own estimate, both sensors'
+costs are summed, and of all explanations within the search's price of the best the simplest is selected: fewest effects first,
+then a common clock before separate lags, then a delay before a filter. All other ones are its rivals.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,14 +25,14 @@ KINDS = (('delay',), ('bandwidth',), ('filter',), ('delay', 'bandwidth'))
 """Descriptions of one sensor's lag, the simplest first."""
 DELAY = KINDS[0]
 FIRST_SHARE = 0.3
-"""Share of a lag that is taken for the low-pass beside a delay at first: at zero it has no derivative of its own."""
+"""Initial share of the low-pass in a lag with a delay: at zero its derivative equals the delay's."""
 COMMON = 0.01
 """
-Where nothing rests, share of what lags explain by which a clock that both sensors share may be behind other lags: noise is known from
-the misfit alone there, and the ripple of a motor is told from a filter by evidence that does not repeat from recording to recording.
+Without rests: largest loss of a common clock against separate lags, as a share of their log likelihood: noise is estimated from
+the misfit there, and the evidence that separates a motor's ripple from a filter is not reproducible between recordings.
 """
 ROUNDS = 3
-"""Times that the columns of a delay beside a low-pass are taken."""
+"""Linearisations of a delay with a low-pass."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Told:
     kind: tuple[str, ...]
     attempt: Attempt
     chosen: list[Question]
-    """The lags of both sensors, then what else was chosen."""
+    """The lags of both sensors, then the other chosen effects."""
 
     @property
     def values(self) -> dict[str, float]:
@@ -77,25 +77,25 @@ class Explanation:
 
     @property
     def rank(self) -> tuple:
-        """What makes an explanation simple."""
+        """Sort key of simplicity."""
         kinds = [name.rpartition('_')[2] for name in self.lags]
         return len(self.lags), CLOCK not in self.lags, sum(map(('delay', 'offset', 'bandwidth', 'filter').index, kinds)), self.cost
 
 
 @dataclass(frozen=True, eq=False)
 class LagExplanations:
-    """Every explanation that a recording may tell of its lags."""
+    """All explanations of the lags of a recording."""
 
     attempt: Attempt
     """Linearised where no lag acts."""
     explanations: Sequence[Explanation]
     rest: Sequence[Question]
-    """What else was chosen."""
+    """The other chosen effects."""
     silent: float | None
-    """Held-out cost without any lag, nats, where nothing rests; None where the noise is known from rests."""
+    """Held-out cost without any lag, nats, without rests; None where rests determine the noise."""
 
     def others(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> list[Explanation]:
-        """Return the explanations of at most so many effects without some, and without others of the same columns, which cost the same."""
+        """Return the explanations with at most so many effects, without given ones and without those of the same columns and cost."""
         costs = {each.cost for each in refused}
         return [each for each in self.explanations if (most is None or len(each.lags) <= most) and each.cost not in costs]
 
@@ -104,7 +104,7 @@ class LagExplanations:
         return simplest(self.others(most, refused), self.silent)
 
     def settled(self, told: Explanation, attempted: Callable) -> tuple[Attempt, list[Question], list[Rival]]:
-        """Return (the Attempt at an explanation, the choice with it, what would do nearly as well in the place of its members)."""
+        """Return (the Attempt at an explanation, the choice with it, alternatives to its members that fit nearly as well)."""
         names = {effect.name: effect.param_names()[0] for effect in self.attempt.effects}
         values = told.values | {names[name]: value for name, value in told.lags.items()}
         there = attempted(point=point_with(self.attempt.baseline, self.attempt.effects, values))
@@ -115,7 +115,7 @@ class LagExplanations:
 
 def lag_explanations(attempt: Attempt, chosen: Sequence[Question], attempted: Callable) -> LagExplanations | None:
     """
-    Return the LagExplanations of a choice; None where no lag is among it, none explains, or some of the family cannot be asked about.
+    Return the LagExplanations of a choice; None where it has no lag, no lag explains the data, or some of the family cannot be tested.
 
     Parameters
     ----------
@@ -141,14 +141,14 @@ def lag_explanations(attempt: Attempt, chosen: Sequence[Question], attempted: Ca
 
 def simplest(explanations: Sequence[Explanation], silent: float | None = None) -> Explanation:
     """
-    Return the simplest explanation of those that come within the search's price of the best.
+    Return the simplest explanation within the search's price of the best.
 
     Parameters
     ----------
     explanations : sequence of Explanation
     silent : float, optional
-        Cost without any lag, where nothing rests: an explanation of as many effects with a shared clock then needs to come only so near
-        as the misfit lets anyone tell.
+        Cost without any lag, for a recording without rests: an explanation of as many effects with a common clock is then accepted
+        within the resolution of the misfit.
 
     """
     best = min(explanation.cost for explanation in explanations)
@@ -161,13 +161,13 @@ def simplest(explanations: Sequence[Explanation], silent: float | None = None) -
 
 
 def _clocks(attempt, chosen):
-    """Return parameter -> value of the chosen clocks that change, None without one: their lags are far from a linear model at zero."""
+    """Return parameter -> value of the chosen clocks that change, None without one: their lags are nonlinear at zero."""
     values, clocks = attempt.values(chosen), [question for question in chosen if question.name in CLOCKS]
     return {attempt.space.names[k]: float(values[k]) for question in clocks for k in question.parameters} or None
 
 
 def _described(attempt, attempted, effects, *, rest, clocks):
-    """Return the description of each kind; the first alone if no curvature is observable."""
+    """Return the description of each kind; only the first if no curvature is observable."""
     def at(kind, values=clocks):
         asked = [effects[lag_name(sensor, ending)] for ending in kind for sensor in SENSORS] + [question.effect for question in rest]
         there = attempted(effects=asked, point=None if values is None else point_with(attempt.baseline, asked, values))
@@ -219,13 +219,13 @@ class _Option:
     covariance: np.ndarray
     values: dict[str, float]
     alike: bool = False
-    """Whether its columns are those of a delay."""
+    """Whether its columns equal those of a delay."""
 
     def own(self, lags):
         return {lag_name(self.sensor, ending): float(value) for ending, value in zip(self.kind, lags)}
 
     def with_delay(self, delay):
-        """Return the lags with the first one given, the others moved along."""
+        """Return the lags with the first one given, the remaining ones shifted accordingly."""
         return self.lags + self.covariance[:, 0] / self.covariance[0, 0] * (delay - self.lags[0])
 
 
@@ -249,7 +249,7 @@ def _cost(told, chosen, judges, sensor):
 
 
 def _told_together(one, two, names):
-    """Yield the explanations of two sensors' lags: each its own, a clock for both and what each has beside it."""
+    """Yield the explanations of two sensors' lags: separate lags, or a common clock and the additional lags of each."""
     values = {name: (two if name.startswith(two.sensor) else one).values[name] for name in names}
     cost = one.cost + two.cost
     own = one.own(one.lags) | two.own(two.lags)
@@ -271,7 +271,7 @@ def _told_together(one, two, names):
 
 
 def _rivals(settled, told, near):
-    """Return what would do nearly as well in the place of a member of an explanation: the members of explanations with no more effects."""
+    """Return the alternatives to a member of an explanation that fit nearly as well: members of explanations with no more effects."""
     asked, found = {question.name: question for question in settled.questions}, {}
     for other in sorted(near, key=lambda explanation: explanation.cost):
         gone, come = sorted(set(told.lags) - set(other.lags)), sorted(set(other.lags) - set(told.lags))

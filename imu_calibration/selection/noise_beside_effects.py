@@ -16,8 +16,8 @@ from imu_calibration.selection.parameter_space import ParameterSpace
 
 STRONG = 10.0
 """
-Twice the logarithm of the Bayes factor by which an effect smooth in time must win over a bias process alone: very strong (Kass, Raftery
-1995), since some fifteen of them are asked.
+Twice the logarithm of the Bayes factor required for an effect smooth in time against a bias process only: very strong (Kass, Raftery
+1995), since some fifteen of them are tested.
 """
 PLAUSIBLE = 3.0
 """
@@ -30,11 +30,11 @@ of one make and their biases wander alike, while a cable pulls along one. Not of
 """
 STABLE = {'accelerometer': 1e-4, 'gyroscope': 0.0}
 """
-Whatever the white noise, a wander of this much is nothing strange, m/s^2 and rad/s: the best accelerometers hold their bias to 10 ug.
+Bias variation that is normal for any white noise, m/s^2 and rad/s: the best accelerometers keep their bias to 10 ug.
 """
 WIDEST = 100.0
 """
-What drifts does so by this many times the usual wander at most: as far as the priors of the effects, those of consumer instruments, go
+Largest drift over the usual bias variation, by which the priors of the effects, for consumer instruments, exceed theirs.
 beyond theirs.
 """
 LEAST_FACTOR = 0.9
@@ -44,19 +44,19 @@ LEAST_FACTOR = 0.9
 def noise_beside_effects(space: ParameterSpace, smooth: dict[str, list[tuple[int, ...]]],
                          known: dict[str, tuple[BiasProcess, ...]] | None = None) -> dict[str, NoiseModel]:
     """
-    Return sensor -> NoiseModel, estimated beside a model with every effect that is asked about.
+    Return sensor -> NoiseModel, estimated together with a model of all candidate effects.
 
-    Windows' offsets and the bias process come from restricted maximum likelihood on the means of the windows; the variance within moving
-    windows from the residual, and its serial correlation from the misfit of each window along its columns.
+    Windows' offsets and the bias process are estimated by restricted maximum likelihood on the means of the windows; the variance within
+    moving windows from the residual, and its serial correlation from the misfit of each window along its columns.
 
     Parameters
     ----------
     space : ParameterSpace
     smooth : dict
-        Sensor -> list of tuples of parameters: effects that are smooth in time. Only the best choice among them, if any is needed, stays
-        in the model beside which the bias process is estimated.
+        Sensor -> list of tuples of parameters: effects that are smooth in time. Only the best choice among them, if any is needed, remains
+        in the model with which the bias process is estimated.
     known : dict, optional
-        Sensor -> how its bias moves, where that was measured apart.
+        Sensor -> its bias processes, where measured separately.
 
     """
     noise, every = first_noise(space), np.arange(space.size)
@@ -68,13 +68,13 @@ def noise_beside_effects(space: ParameterSpace, smooth: dict[str, list[tuple[int
 
 
 def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ...]:
-    """Return how a bias moves at least: as is known, else by the white noise of the sensor and the time between samples, s."""
+    """Return the least bias processes: the known ones, else from the white noise of the sensor and the time between samples, s."""
     return noise.known or (BiasProcess(NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), TIMES[0]),)
 
 
 def plausible_processes(noise: NoiseModel, period: float, *, sensor: str, duration: float) -> tuple[BiasProcess, ...]:
     """
-    Return how a bias moves as far as that passes for noise.
+    Return the bias processes up to a size that is plausible as noise.
 
     As found in the recording, naturally at least, at most as such biases do within its duration, s: further where all axes do so.
     """
@@ -105,7 +105,7 @@ def _white_without_rest(space, sensor):
 
 
 def _with_moving_factors(space, sensor, noise, values, look_along):
-    """Return the noise with what moving windows scatter: the residual's variance, and more where it lies along the columns."""
+    """Return the noise with the scatter of moving windows: the residual's variance, and a factor for directions along the columns."""
     found = {}
     for kind in np.unique(space.recording.kind[space.recording.moving]):
         rows = space.recording.kind == kind
@@ -128,7 +128,7 @@ def _with_moving_factors(space, sensor, noise, values, look_along):
 
 
 def _with_bias_process(space, sensor, noise, smooth):
-    """Return the noise of a sensor with window offsets and bias process, estimated beside all effects but the superfluous smooth ones."""
+    """Return the noise of a sensor with window offsets and bias process, estimated with all effects but the superfluous smooth ones."""
     own, recording = np.unique(np.concatenate(space.index[sensor])), space.recording
     place = {parameter: k for k, parameter in enumerate(own)}
     rows = np.zeros((len(recording.windows), 3, len(own) + 1))
@@ -153,8 +153,8 @@ def drift_prior(columns: np.ndarray, prior_sd: np.ndarray, usual: float) -> np.n
     """
     Return the prior sd of parameters as drifts of a sensor, shape (q,).
 
-    By that of the catalogue, made for consumer instruments, a navigation gyroscope would drift by 15 000 times its wander, and whatever it
-    does drift by were unlikely.
+    With the prior of the catalogue, for consumer instruments, a navigation gyroscope would drift by 15 000 times its bias
+    variation, and its actual drift would be unlikely.
 
     Parameters
     ----------
@@ -171,10 +171,10 @@ def drift_prior(columns: np.ndarray, prior_sd: np.ndarray, usual: float) -> np.n
 
 def _needed_smooth(search, structural, options, *, prior_sd):
     """
-    Return the parameters of the smooth effect that beats the bias process, each with the noise estimated beside it.
+    Return the parameters of the smooth effect that beats the bias process, each with the noise estimated jointly.
 
     By restricted likelihood, all parameters integrated out under their priors: at its maximum over as many as there are windows the wander
-    comes out too small, and noise of 15 s looks like a drift.
+    is underestimated, and noise of 15 s resembles a drift.
     """
     losses = [search.best(structural)[1]]
     losses += [search.best(structural + option)[1] + 2 * np.log(prior_sd[option]).sum() + STRONG for option in options]
@@ -182,7 +182,7 @@ def _needed_smooth(search, structural, options, *, prior_sd):
 
 
 def _known_otherwise(space, sensor, noise, own):
-    """Return the normal matrix of what priors and the inside of windows tell about the parameters `own`."""
+    """Return the information on the parameters `own` from priors and from within windows (normal matrix)."""
     at = np.append(own, space.size)
     information = within_matrix(space, noise, sensors=(sensor,))[np.ix_(at, at)]
     prior = 1 / space.prior_sd[own]**2

@@ -18,7 +18,7 @@ def normal_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: n
 
 def within_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None, *,
                   sensors: Sequence[str] = SENSORS) -> np.ndarray:
-    """Return the part of the normal matrix that comes from within the windows."""
+    """Return the part of the normal matrix from within the windows."""
     total = np.zeros((space.size + 1, space.size + 1))
     for sensor in sensors:
         for axis in range(3):
@@ -37,7 +37,7 @@ def within_of_axis(space: ParameterSpace, noise: NoiseModel, sensor: str, *, axi
 
 
 def mean_matrix(space: ParameterSpace, white: dict[str, list[np.ndarray]], select: np.ndarray | None = None) -> np.ndarray:
-    """Return the part that comes from the means of the windows, from sensor -> `white_means`."""
+    """Return the part from the means of the windows, from sensor -> `white_means`."""
     total = np.zeros((space.size + 1, space.size + 1))
     for sensor, axes in white.items():
         for axis, rows in enumerate(axes):
@@ -47,7 +47,7 @@ def mean_matrix(space: ParameterSpace, white: dict[str, list[np.ndarray]], selec
 
 
 def scatter_of_each(space: ParameterSpace, noise: dict[str, NoiseModel], values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return sensor -> by how many times each window scatters more within, beside parameters (q,), than others of its kind, (k, 3)."""
+    """Return sensor -> factor of each window's scatter within, at parameters (q,), over its kind, shape (k, 3)."""
     recording, found, reduced = space.recording, {}, space.reduced(range(space.size), values)
     for sensor in SENSORS:
         usual = np.array([noise[sensor].row_variance(name) for name in recording.kind]) * np.maximum(recording.count - 1, 1)[:, None]
@@ -61,7 +61,7 @@ def white_means(space: ParameterSpace, noise: dict[str, NoiseModel], sensor: str
     """
     Return for each axis the mean rows, turned into independent rows of unit variance, shape (k, q_a + 1).
 
-    `scatter` says by how many times each window scatters more within than others of its kind, shape (k, 3).
+    `scatter`: factor of each window's scatter within over its kind, shape (k, 3).
     """
     recording, own = space.recording, noise[sensor]
     variance = own.variance_beside_bias(recording.kind, recording.count, recording.duration, keys=recording.keys) + own.offset_sd**2

@@ -1,4 +1,4 @@
-"""All pairs of effects at once, for causes of which no single one explains much alone."""
+"""Test of all pairs of effects, for causes that no single effect explains."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ def best_pairs(search: Search) -> list[list[Question]]:
     """
     Return the pairs that lower the loss most and are possible, the best first, at most three.
 
-    The normal matrix with the baseline projected out and each effect's own block made the unit matrix leaves a system of two blocks for
-    each pair; systems of one shape are solved together. Both members must keep some signal that the other cannot imitate. That each
-    survives the removal of the other is asked by the search that starts from the pair (`Search.run`).
+    The normal matrix with the baseline projected out and each effect's block scaled to the unit matrix gives a system of two blocks for
+    each pair; systems of one shape are solved together. Each member must keep some signal that is not collinear with its mate. That each
+    is significant without its mate is tested by the search from the pair (`Search.run`).
     """
     blocks = _Blocks(search)
     shapes = defaultdict(list)
@@ -43,7 +43,7 @@ def best_pairs(search: Search) -> list[list[Question]]:
 
 
 class _Blocks:
-    """Normal equations of all questions beside the baseline, each question's own block the unit matrix."""
+    """Normal equations of all questions, baseline projected out, each question's own block the unit matrix."""
 
     def __init__(self, search):
         self.questions, (information, right) = search.questions, search.evidence.equations()
@@ -68,7 +68,7 @@ class _Blocks:
         return len(self.questions[number].parameters)
 
     def score(self, pairs: Sequence[tuple[int, int]]):
-        """Yield (fall of the loss in nats less the penalty, one, two) of pairs of one shape whose members keep a share of their own."""
+        """Yield (fall of the loss in nats less the penalty, one, two) of pairs of one shape with members that are not collinear."""
         places = np.array([[*range(*self.at[a].indices(len(self.right))), *range(*self.at[b].indices(len(self.right)))] for a, b in pairs])
         n_first = self.size(pairs[0][0])
         systems = self.matrix[places[:, :, None], places[:, None, :]] + 1e4 * JITTER * np.eye(places.shape[1])

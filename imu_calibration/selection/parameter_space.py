@@ -1,4 +1,4 @@
-"""From columns to parameters: each window's contribution to a linear problem in the parameters of everything that is asked."""
+"""From columns to parameters: each window's contribution to a linear problem in the parameters of all candidate effects."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,9 +16,9 @@ from imu_calibration.selection.reduced_recording import ReducedRecording
 @dataclass(frozen=True, eq=False)
 class ParameterSpace:
     """
-    A reduced recording in the parameters that are asked about.
+    A reduced recording in the parameters under test.
 
-    Those of the extended model come first, then the amplitudes of the banks of time constants, per sensor. Rows are
+    The parameters of the extended model are first, then the amplitudes of the banks of time constants, per sensor. Rows are
     ``[design | residual]`` of one axis; all their columns act on that axis.
     """
 
@@ -38,13 +38,13 @@ class ParameterSpace:
     """
     join_within: dict[str, list[np.ndarray]]
     """
-    The same for what is within windows: of effects that are smooth in time nothing, since the bias wanders there too and the noise within
-    is taken to be white.
+    The same for the part within windows: zero for effects that are smooth in time, since the bias varies there too and the noise within
+    is modelled as white.
     """
     slow_only: dict[str, np.ndarray] = field(default_factory=lambda: {sensor: np.zeros(3, bool) for sensor in SENSORS})
     """Sensor -> whether only the slow part of the centred rows is compared, shape (3,)."""
     slow_variance: dict[str, np.ndarray] = field(default_factory=lambda: {sensor: np.zeros(3) for sensor in SENSORS})
-    """Sensor -> variance of the white noise that then stands in for the fast part, shape (3,)."""
+    """Sensor -> variance of the white noise that then replaces the fast part, shape (3,)."""
 
     @property
     def size(self) -> int:
@@ -52,11 +52,11 @@ class ParameterSpace:
         return len(self.names)
 
     def places(self, sensor: str, axis: int) -> np.ndarray:
-        """Return where the rows of an axis stand in a normal matrix of all parameters, shape (q_a + 1,)."""
+        """Return the positions of the rows of an axis in a normal matrix of all parameters, shape (q_a + 1,)."""
         return np.append(self.index[sensor][axis], self.size)
 
     def reduced(self, used: Sequence[int], values: np.ndarray) -> np.ndarray:
-        """Return the vector that turns rows of all parameters into residuals at `values` of those `used`, shape (q + 1,)."""
+        """Return the vector that maps rows of all parameters to residuals at `values` of the parameters `used`, shape (q + 1,)."""
         found = np.zeros(self.size + 1)
         found[list(used)], found[-1] = -values, 1.0
         return found
@@ -70,7 +70,7 @@ class ParameterSpace:
         """
         Return the products of the centred rows of each of the windows `rows` (mask), shape (k, q_a + 1, q_a + 1).
 
-        `part` 'within' or 'slow'; without it what is compared on that axis.
+        `part` 'within' or 'slow'; default: the part in use on that axis.
         """
         slow_only = part is None and self.slow_only[sensor][axis]
         products = self.recording.products_of(sensor, 'slow' if slow_only else part or 'within')[rows]
@@ -96,14 +96,14 @@ class ParameterSpace:
         return np.maximum(np.einsum('kij,ki,kj->k', self.recording.products_of(sensor, 'within'), columns, columns, optimize=True), 0.0)
 
     def _joined(self, sensor, axis, products, missing):
-        """Return products with the columns of an axis, and with the squares that stand for the fast part."""
+        """Return products with the columns of an axis, and with the squares that replace the fast part."""
         join = self.join_within[sensor][axis]
         found = join.T @ (products @ join)
         found[:, -1, -1] += missing
         return found
 
     def _missing(self, sensor, axis):
-        """Return the squares that stand for the fast part of each window, shape (k,)."""
+        """Return the squares that replace the fast part of each window, shape (k,)."""
         return self.slow_variance[sensor][axis] * np.maximum(self.recording.count - np.maximum(self.recording.slow_rows, 1), 0.0)
 
 
@@ -111,14 +111,14 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
     """
     Return the ParameterSpace of a recording: the Jacobian of the coefficients joins columns to parameters.
 
-    Parameters of the baseline count from the values of the linearisation; those of all other effects from nothing, so that an
-    effect that is left out is absent even where the columns were taken with it.
+    Parameters of the baseline are relative to the point of linearisation; parameters of all other effects are absolute, so that an
+    omitted effect is zero even where the point of linearisation includes it.
 
     Parameters
     ----------
     recording : ReducedRecording
     baseline : SensorModel
-        The model that is asked what it lacks.
+        The model to be extended.
 
     """
     model, bank = recording.model, [entry for sensor in SENSORS for entry in recording.bank[sensor]]
@@ -148,7 +148,7 @@ def bank_places(recording: ReducedRecording) -> dict[str, slice]:
 
 
 def _join(model, sensor, axis, recording, removed, smooth):
-    """Return (parameters that act on an axis, matrix that joins columns to them, that of what is within windows)."""
+    """Return (parameters that act on an axis, matrix that joins columns to them, the matrix for the part within windows)."""
     bank, places = recording.bank[sensor], bank_places(recording)
     jacobian = coefficient_jacobian(model, sensor, recording.values)[:, axis]
     p, n_model = jacobian.shape

@@ -1,4 +1,4 @@
-"""Which effects can be asked about in this recording, and which cannot, and why."""
+"""Testable effects of a recording; for each untestable effect the reason."""
 
 from dataclasses import dataclass, replace
 from typing import Callable, Sequence
@@ -14,23 +14,23 @@ from imu_calibration.segmentation.quiet_detector import least_variance
 from imu_calibration.segmentation.window import Window
 
 TURN = 4 * HALF_WIDTH
-"""What is enough of a turn, K."""
+"""Sufficient reversal of the temperature, K."""
 TEMPERATURE_SPAN = 1.0
 """Least span of temperature that can show a thermal effect, K."""
 BRANCHES_APART = 1.5
-"""Least span of the thermal branch, from -1 to 1, that tells cooling from warming up."""
+"""Least span of the thermal branch, from -1 to 1, that separates cooling from warming up."""
 SHAKEN, LEAST_SHAKEN = VIBRATES, 3
-"""It vibrates in a rest whose noise has this many times the variance of the quietest, and must in so many."""
+"""A rest has vibration if its noise has this many times the variance of the quietest; least number of such rests."""
 N_TIME_CONSTANTS = 12
-"""Warm-ups are asked for at this many time constants."""
+"""Number of time constants in the bank of warm-ups."""
 
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """One effect that is asked about; a warm-up is asked for at each time constant of a bank."""
+    """One effect under test; a warm-up is tested at each time constant of a bank."""
 
     effect: Effect
-    """What is asked about."""
+    """The effect under test."""
     parameters: tuple[int, ...]
     """Indices in the parameter space."""
     penalty: int
@@ -51,12 +51,12 @@ class Question:
 
 def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]) -> tuple[list[Effect], list[dict]]:
     """
-    Return (effects that can be asked about, list of {'effect', 'why', 'needs'} for the others).
+    Return (testable effects, list of {'effect', 'why', 'needs'} for all other ones).
 
     Parameters
     ----------
     model : SensorModel
-        The baseline; its effects are not asked about again.
+        The baseline; its effects are not tested again.
     table : Table
         The searcher's description of the table.
     windows : sequence of Window
@@ -73,9 +73,9 @@ def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]
 
 def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], list[dict]]:
     """
-    Return (effects that can be asked about, list of {'effect', 'why', 'needs'}) of the catalogue's that the model lacks.
+    Return (testable effects, list of {'effect', 'why', 'needs'}) of the catalogue's effects that the model lacks.
 
-    ``why_not(effect)`` gives (why, needs), or None for what can be asked about.
+    ``why_not(effect)`` gives (why, needs), or None for a testable effect.
     """
     known, lacking = [], []
     have = {e.key for e in model.effects}
@@ -103,7 +103,7 @@ def _branch_span(windows):
 
 
 def _vibrates(windows):
-    """Return whether it vibrates in some rests more than in others."""
+    """Return whether vibration differs between rests."""
     rests = [window for window in windows if window.kind == 'static' and len(window) > 3]
     variances = np.array([max(window.noise_sd[0] @ window.noise_sd[0], least_variance(window.force_s)) for window in rests])
     return np.count_nonzero(variances > SHAKEN * variances.min(initial=np.inf)) >= LEAST_SHAKEN
@@ -137,19 +137,19 @@ def _why_not(effect, have, table, kinds, span):
 
 
 def time_constants(duration: float) -> np.ndarray:
-    """Return the time constants at which warm-ups are asked for, s."""
+    """Return the time constants of the bank of warm-ups, s."""
     return np.geomspace(max(duration / 30, 5.0), 2.0 * duration, N_TIME_CONSTANTS)
 
 
 def extended_model(model: SensorModel, effects: Sequence[Effect]) -> SensorModel:
-    """Return the model with all these effects, but for those that are asked otherwise (warm-ups, saturation)."""
+    """Return the model with all these effects, except those that are tested differently (warm-ups, saturation)."""
     kept = [e for e in effects if e.warp is not None or not special(e)]
     added = {sensor: tuple(e.name for e in kept if e.sensor == sensor) for sensor in SECTIONS}
     return replace(model, **{sensor: getattr(model, sensor) + names for sensor, names in added.items()})
 
 
 def point_with(model: SensorModel, effects: Sequence[Effect], values: dict[str, float]) -> tuple[SensorModel, np.ndarray]:
-    """Return (the model with all these effects linearised there, its parameters) where some have values, others their prior."""
+    """Return (the model with all these effects linearised there, its parameters) at the given values, else at the prior."""
     wide = extended_model(model, effects)
     start = np.array([values.get(name, known) for name, known in zip(wide.param_names, wide.start())])
     start = np.where(np.isfinite(start), start, 0.0)
@@ -157,7 +157,7 @@ def point_with(model: SensorModel, effects: Sequence[Effect], values: dict[str, 
 
 
 def without_saturation(effects: Sequence[Effect]) -> list[Effect]:
-    """Return the effects that are asked about by columns."""
+    """Return the effects that are tested by columns."""
     return [effect for effect in effects if effect.role is not Role.LIMIT]
 
 

@@ -1,4 +1,4 @@
-"""A recording reduced with the columns of every effect that is asked about: all that candidates, folds and resamples need."""
+"""A recording reduced with the columns of all candidate effects: sufficient for candidates, folds and resamples."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,15 +23,15 @@ class ReducedRecording:
     """Windows of one recording as statistics of ``[columns of the model | bank of time constants | output]``; residuals at a point."""
 
     model: SensorModel
-    """Every effect that is asked about, linearised at its point."""
+    """Model of all candidate effects, linearised at its point."""
     values: np.ndarray
     """Parameters that residuals belong to."""
     bank: dict[str, list[BankEntry]]
-    """Sensor -> effects with a time constant, at each of some; their columns come last."""
+    """Sensor -> effects with a time constant, at each of a bank; their columns are last."""
     windows: tuple[WindowStatistics, ...]
     """Reduced as for a calibration, kept one by one."""
     describe: dict[str, np.ndarray]
-    """Window means of what a residual may depend on: 'time', 'temperature', joint angles, rates; each (k,)."""
+    """Window means of variables that a residual may depend on: 'time', 'temperature', joint angles, rates; each (k,)."""
 
     @cached_property
     def kind(self) -> np.ndarray:
@@ -86,7 +86,7 @@ class ReducedRecording:
         """Return the products of the centred rows ``[columns | residual]`` of each window, shape (k, p + 3, p + 3)."""
         if (sensor, part) not in self._products:
             width = len(self.windows[0].sensors[sensor].mean)
-            found = self._products[sensor, part] = np.zeros((len(self.windows), width, width))   # of windows at rest nothing is written
+            found = self._products[sensor, part] = np.zeros((len(self.windows), width, width))   # windows at rest have zeros
             for k, rows in self._centred(sensor, part, self.moving):
                 np.matmul(rows.T, rows, out=found[k])
         return self._products[sensor, part]
@@ -122,19 +122,19 @@ class ReducedRecording:
         return rows
 
     def rebased(self, values: np.ndarray) -> 'ReducedRecording':
-        """Return the same recording with the residual of other `values`; the columns stay where they were taken."""
+        """Return the same recording with the residual of other `values`; the point of linearisation is unchanged."""
         moved = replace(self, values=values)
         moved.__dict__.update({name: self.__dict__[name] for name in ('kind', 'moving', 'time', 'count', 'slow_rows', 'sessions')
                                if name in self.__dict__})
         return moved
 
     def select(self, rows: np.ndarray) -> 'ReducedRecording':
-        """Return the recording of the windows `rows` (mask) alone."""
+        """Return the recording of the windows `rows` (mask) only."""
         return replace(self, windows=tuple(window for window, kept in zip(self.windows, rows) if kept),
                        describe={name: values[rows] for name, values in self.describe.items()})
 
     def accumulated(self, model: SensorModel) -> Accumulator:
-        """Return the Accumulator of a model whose columns are among those of this recording's."""
+        """Return the Accumulator of a model; its columns are a subset of this recording's."""
         chosen = selected_columns(self.model, model)
         accumulator = Accumulator()
         for window in self.windows:
@@ -192,7 +192,7 @@ def mean_arms(model: SensorModel, values: np.ndarray) -> np.ndarray:
     """
     Return the mean lever arm of the accelerometers for each of them, zero where a model has none, shape (3, 3).
 
-    Their differences change the derivative of a delay little where they are millimetres, and distort it where a recording does not show
-    them and they come out as centimetres.
+    Their differences change the derivative of a delay little where they are millimetres, and distort it where a recording does not
+    determine them and they are estimated as centimetres.
     """
     return np.tile(all_arms(model, values).mean(axis=0), (3, 1))

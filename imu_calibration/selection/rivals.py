@@ -1,4 +1,4 @@
-"""Effects that are one column where they are small, such as a delay and a lag: told apart where each is as large as it is."""
+"""Effects that are collinear where small, such as a delay and a lag: compared at their estimated sizes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,35 +12,35 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import PENALTY, TIE
 
 SHOWN = 0.1
-"""Evidence of a curvature below which it tells nothing from anything, nats: a delay of 0.1 ms is a lag of 0.1 ms."""
+"""Evidence of a curvature below which it does not separate effects, nats: a delay of 0.1 ms is a lag of 0.1 ms."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """What would do nearly as well as a choice."""
+    """An alternative to a chosen effect that fits nearly as well."""
 
     question: Question
-    """The effect in whose place it stands."""
+    """The effect that it would replace."""
     other: Question
-    """The effect that was not taken."""
+    """The effect that was not chosen."""
     behind: float
     """Held-out log likelihood that it lacks, nats, each linearised where it is."""
     moves: dict[str, float] = field(default_factory=dict)
-    """Parameter of the baseline -> by how much it differs when the rival is taken."""
+    """Parameter of the baseline -> its difference with the rival in the model."""
 
     @property
     def weight(self) -> float:
-        """Share of the belief that evidence leaves to the rival."""
+        """Posterior probability of the rival."""
         return float(1.0 / (1.0 + np.exp(min(self.behind, 700.0))))
 
 
 def settle_rivals(attempt: Attempt, chosen: Sequence[Question], attempted: Callable) -> tuple[Attempt, list[Rival]]:
     """
-    Return (the Attempt at the best of a choice and its rivals, the rivals that come near it).
+    Return (the Attempt at the best of a choice and its rivals, the rivals close to it).
 
-    The first derivatives of a delay and of a low-pass are the same, and a search that takes its columns at one of them sees the other by
-    its straight line alone: whichever it met first would win. So each is linearised where it is, and all are judged with the same noise,
-    that of each in turn; only those that are compared have columns there.
+    The first derivatives of a delay and of a low-pass are the same, and a search that is linearised at one of them represents its rival by
+    its tangent only: the first one would win. So each is linearised at its own estimate, and all are compared with the same noise,
+    estimated with each in turn; only compared effects have columns there.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def settle_rivals(attempt: Attempt, chosen: Sequence[Question], attempted: Calla
 
 
 def same_questions(attempt: Attempt, chosen: Sequence[Question]) -> list[Question]:
-    """Return the questions of another attempt that ask the same: a warm-up that it has in its bank at the likeliest time constant."""
+    """Return the same questions in another attempt: a warm-up at the likeliest time constant of its bank."""
     found = []
     for each in chosen:
         asked = [question for question in attempt.questions if question.name == each.name]
@@ -82,7 +82,7 @@ def same_questions(attempt: Attempt, chosen: Sequence[Question]) -> list[Questio
 
 
 def _swapped(attempt, chosen):
-    """Return the choices in which an effect gave way to one that only its curvature tells from it, where that can tell anything."""
+    """Return the choices with an effect replaced by one that only curvature separates from it, where the curvature is observable."""
     return [[other if each is question else each for each in chosen] for question in chosen
             if question.effect.warp is not None and attempt.curvature_shows(chosen, question) > SHOWN
             for other, _ in attempt.search.class_mates(chosen, question, most=None) if other.effect.warp is not None]

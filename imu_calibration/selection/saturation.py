@@ -19,9 +19,9 @@ from imu_calibration.segmentation.window import Window
 MARGIN = 4.0
 """Samples predicted within this many standard deviations of the limit are left out: noise decides whether they are clipped."""
 AGREEMENT = 0.25
-"""Least sum of the chances of being beyond the limit over clipped samples, as a share of what it is when they are clipped by that chance.
+"""Least sum of the probabilities of exceeding the limit over clipped samples, as a share of its expectation for clipping by noise.
 
-Near one g at rest only the tails of the noise are cut: a right limit then gives each of the samples a chance of a tenth."""
+Near one g at rest only the tails of the noise are cut: a correct limit then has a probability of a tenth for each sample."""
 LEAST_CLIPPED = 4
 SHORTEST = 20
 """A window with fewer samples left is dropped."""
@@ -48,7 +48,7 @@ class Saturation:
 
     @property
     def p_value(self) -> float:
-        """Chance that no sample passes a level that so many are expected beyond (Poisson)."""
+        """Probability that no sample exceeds a level, from the expected number (Poisson)."""
         return float(np.exp(-self.n_expected))
 
 
@@ -109,7 +109,7 @@ def may_be_clipped(windows: Sequence[Window], sensor: str) -> bool:
     at = int((size >= level * (1 - 1e-12)).sum())
     if at < LEAST_CLIPPED or level == 0:
         return False
-    # A coarse output repeats all its values; those just below the largest show how often, the step that gravity sits on above all.
+    # A coarse output repeats all its values, most of all the step at gravity; the values just below the largest show how often.
     _, repeats = np.unique(size[(size < level * (1 - 1e-12)) & (size > 0.9 * level)], return_counts=True)
     return bool(at > 3 * repeats[-5:].max(initial=1))
 
@@ -122,7 +122,7 @@ def find_saturation(windows: Sequence[Window], predicted: list, noise_sd: np.nda
     ----------
     windows : sequence of Window
     predicted : list of (force, rate)
-        What a model without limit predicts (`predictions`).
+        Prediction of a model without limit (`predictions`).
     noise_sd : array, shape (3,)
         Standard deviation of single samples.
 
@@ -146,7 +146,7 @@ def find_saturation(windows: Sequence[Window], predicted: list, noise_sd: np.nda
 def without_clipped(windows: Sequence[Window], predicted: list, levels: dict[str, float], *,
                     noise_sd: dict[str, np.ndarray]) -> list[Window]:
     """
-    Return the windows without samples that a limit spoils: those at it, and those predicted within a few standard deviations of it.
+    Return the windows without samples that are clipped, or predicted within a few standard deviations of the limit.
 
     Parameters
     ----------

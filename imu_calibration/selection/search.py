@@ -13,37 +13,37 @@ from imu_calibration.selection.evidence import Evidence
 from imu_calibration.selection.questions import Question
 
 FAMILY_WISE = 0.001
-"""Chance of a finding in a recording whose model is right."""
+"""Probability of a finding in a recording with a correct model."""
 LEAST_GAIN = 4.0
 """Least gain of held-out log likelihood, nats."""
 PENALTY = 1.0
-"""Penalty for a parameter beside what held-out prediction charges, nats."""
+"""Penalty for a parameter in addition to that of held-out prediction, nats."""
 BETTER = 0.01
 """Least fall of the held-out cost for which an effect is replaced, nats: two lags are a delay, and less than this is rounding."""
 TIE = 8.0
-"""Effects whose held-out log likelihood comes this close are not told apart by the recording, nats."""
+"""Difference of held-out log likelihood up to which effects are not separable by the recording, nats."""
 IMPLAUSIBLE = 8.0
-"""Price of a size beyond what is known of any instrument, nats: what is plausible and does as well is the explanation."""
+"""Price of a size above that of any known instrument, nats: a plausible effect with the same fit is preferred."""
 MOST_FINDINGS = 6
 """Effects that one recording may be found to lack."""
 CLASS_SIZE = 3
-"""Members of a class of effects that are not told apart, the named one included."""
+"""Members of a class of inseparable effects, the named one included."""
 
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Evidence for one effect beside the model so far."""
+    """Evidence for one effect given the current model."""
 
     question: Question
-    """What was asked about."""
+    """The effect under test."""
     gain: float
     """Gain of held-out log likelihood, nats."""
     p_value: float
-    """Chi-square p-value times the number of effects asked about, at most 1."""
+    """Chi-square p-value times the number of effects under test, at most 1."""
     allowed: bool
     """Whether the estimate is physically possible."""
     implausible: bool = False
-    """Whether its size is beyond what is known of any instrument."""
+    """Whether its size exceeds that of any known instrument."""
 
     @property
     def net(self) -> float:
@@ -69,9 +69,9 @@ class Search:
     encoder_step : float
         Resolution of the encoders, rad.
     any_size : bool
-        Whether sizes that are known of no instrument are asked about: for what known ones leave.
+        Whether sizes above those of any known instrument are allowed, for a remaining excess.
     resolved : set of str
-        Effects that were judged beside one another where each is, which straight lines must not undo: not asked unless chosen.
+        Effects that were compared at their own linearisation; this search must not revise them: not tested unless chosen.
 
     """
 
@@ -107,7 +107,7 @@ class Search:
         """
         Return whether the effect's estimate is possible.
 
-        A lag is not negative, no angle (at 1 g) is within half an encoder step, and no size is implausible, unless asked.
+        A lag is not negative, no angle (at 1 g) is within half an encoder step, and no size is implausible, unless allowed.
         """
         value, sd = self.estimate(chosen, question)
         if question.effect.nonnegative and value[0] < 0:
@@ -119,12 +119,12 @@ class Search:
         return (self.any_size or not self.implausible(chosen, question)) and self.shows_alike(chosen, question)
 
     def early(self, chosen: Sequence[Question]) -> list[Question]:
-        """Return the lags that would be significant, were they not negative: a clock that is early behind a sensor that is late."""
+        """Return the lags that would be significant if they were not negative: an early clock with a late sensor."""
         scores = [self.score(chosen, q) for q in self.others(chosen) if q.effect.nonnegative and self.estimate([*chosen, q], q)[0][0] < 0]
         return [score.question for score in scores if replace(score, allowed=True).significant]
 
     def implausible(self, chosen: Sequence[Question], question: Question) -> bool:
-        """Return whether the estimate of a chosen effect is beyond what is known of any instrument: a range is a prior, not a wall."""
+        """Return whether the estimate of a chosen effect exceeds any known instrument; the range is a prior, not a hard limit."""
         amplitudes = question.effect.size - question.effect.time_constant
         value, sd = self.estimate(chosen, question)
         return question.effect.surpasses(value[:amplitudes], sd[:amplitudes])
@@ -140,7 +140,7 @@ class Search:
         """
         Return whether no sensor on which an effect acts is predicted worse with it.
 
-        A cause of the table that explains one sensor and spoils the other is a story of the one.
+        A cause in the table must not improve one sensor and degrade the second.
         """
         if question.sensor in SENSORS or len(question.effect.acts_on) < 2:
             return True
@@ -166,7 +166,7 @@ class Search:
         return chosen
 
     def reconsidered(self, chosen: Sequence[Question]) -> Sequence[Question]:
-        """Return the choice after dropping what is no longer needed and replacing what a better explanation replaces."""
+        """Return the choice without effects that are no longer needed, and with better explanations substituted."""
         for _ in range(6):
             smaller = self._dropped(chosen)
             if smaller is not None:
@@ -188,7 +188,7 @@ class Search:
     def _replaced(self, chosen):
         best, cost = None, self.cost(chosen) - BETTER
         for place, question in enumerate(chosen):
-            if question.name in self.resolved:   # it could not come back, and what outweighs it may be there beside it
+            if question.name in self.resolved:   # it could not be added again, and an effect that cancels it may be in the model
                 continue
             rest = chosen[:place] + chosen[place + 1:]
             for other in self.others(rest):
@@ -201,7 +201,7 @@ class Search:
         return best
 
     def standing(self, chosen: Sequence[Question]) -> Sequence[Question]:
-        """Return what stays significant of a choice that others were taken from: of a clock and a lag that make up for it none does."""
+        """Return the effects of a choice that are still significant after removals: of a clock and a lag that cancel, none."""
         while (smaller := self._dropped(chosen)) is not None:
             chosen = smaller
         return chosen
@@ -215,7 +215,7 @@ class Search:
             trial = [*chosen[:place], other, *chosen[place + 1:]]
             difference = self.cost(trial) - cost
             if question.effect.contained_in == other.name:
-                continue  # a special case that does as well as the whole wins, and the whole is no rival of it
+                continue  # a special case with an equal fit is preferred, and the general effect is not its rival
             if difference < TIE and self.allowed(trial, other):
                 if other.name not in found or difference < found[other.name][1]:
                     found[other.name] = (other, difference)
@@ -224,16 +224,16 @@ class Search:
 
 def least_angle(effect: Effect, encoder_step: float) -> float:
     """
-    Return the size of an effect, an angle (at 1 g), that is half an encoder step (rad); 0 for what is no angle.
+    Return the size of an effect, an angle (at 1 g), that is half an encoder step (rad); 0 for other effects.
 
-    Steps are the same each time the table comes back to a pose: they do not average out, and look like errors of the table.
+    Steps repeat each time the table returns to a pose: they do not average out, and resemble errors of the table.
     """
     angles: dict[str | tuple, float] = {'rad': 1.0, 'rad/(m/s^2)': STANDARD_GRAVITY}
     return 0.5 * encoder_step / angles[effect.unit] if effect.unit in angles else 0.0
 
 
 class Named(ABC):
-    """What a search named, told apart by whether its sizes are known of instruments."""
+    """Findings of a search, separated by plausibility of their sizes."""
 
     named: Sequence[Question]
 
@@ -244,7 +244,7 @@ class Named(ABC):
 
     @property
     def implausible(self) -> list[Question]:
-        """Findings whose size is beyond what is known of any instrument: told, and put into no model unasked."""
+        """Findings with sizes above those of any known instrument: reported, but added to a model only on request."""
         return [question for question in self.named if self.search.implausible(self.named, question)]
 
     @property

@@ -1,4 +1,4 @@
-"""Of two explanations the simpler one, where misfit stays that nobody explains."""
+"""Preference for the simpler of two explanations in the presence of unexplained misfit."""
 
 from collections.abc import Sequence
 
@@ -8,15 +8,15 @@ from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.questions import Question
 
 AS_MUCH = 0.5
-"""Share of the held-out likelihood of an effect that a simpler one must reach to be asked in its place."""
+"""Share of the held-out likelihood of an effect that a simpler one must reach to be tested as its replacement."""
 
 
 def simpler(attempt: Attempt, explained: Explained, named: Sequence[Question]) -> Sequence[Question]:
     """
-    Return findings of which none has more parameters than the residual of windows held out asks for.
+    Return findings with no more parameters than the held-out residual supports.
 
-    Beside misfit that nobody explains likelihood takes whatever has more parameters: arms of the three accelerometers, where one arm of all
-    of them does as well. So an effect with fewer parameters takes the place of a finding when the plain residual, in the unit of the
+    With unexplained misfit, likelihood prefers more parameters: arms of the three accelerometers, where one common arm
+    fits as well. So an effect with fewer parameters replaces a finding when the unweighted residual, in the unit of the
     sensor, is not sure to fall by `LEAST_REDUCTION` from the one to the other.
     """
     kept = list(named)

@@ -1,4 +1,4 @@
-"""Effects with a time constant are asked about at each of a bank of time constants: there their columns are linear in the amplitudes."""
+"""Effects with a time constant are tested at each of a bank of time constants, where their columns are linear in the amplitudes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from imu_calibration.reference.reference_motion import Reference
 WIDE = 10.0
 """
 Standard deviations of amplitudes in a bank, times the effect's own: neighbours share one curve with opposite signs, and where the prior
-held them the noise beside them came out otherwise; from six times on it does not matter.
+constrained them the estimated noise changed; from a factor of six on it does not.
 """
 
 
@@ -26,7 +26,7 @@ class BankEntry:
     number: int
     """Number of the time constant."""
     point: dict
-    """Where its columns are taken."""
+    """Point of linearisation."""
     used: tuple
     """(ColumnGroup, columns that the amplitudes multiply), ..."""
     slopes: np.ndarray

@@ -12,10 +12,10 @@ from imu_calibration.selection.parameter_space import ParameterSpace
 
 def in_trusted_band(space: ParameterSpace) -> ParameterSpace:
     """
-    Return the space whose centred rows are compared by their slow part alone on axes whose fast part stays wrong beside every effect.
+    Return the space with only the slow part of the centred rows on axes with a fast part that no effect explains.
 
     Joint states at 100 Hz do not show a motor's ripple at 47 Hz, and no effect of the catalogue makes up for it; judged sample by sample,
-    such a recording shows whatever makes the ripple smaller. In the place of the fast part stands white noise of the slow part's
+    such a recording is evidence for any effect that reduces the ripple. The fast part is replaced by white noise of the slow part's
     variance, so that all counts of samples hold.
     """
     recording, moving = space.recording, space.recording.moving
