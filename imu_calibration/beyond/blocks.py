@@ -1,4 +1,4 @@
-"""The rest of one sensor in short blocks, beside the columns of everything that was asked: what regimes and formulas are judged on."""
+"""The residual of one sensor in short blocks, with the columns of all candidate effects: data for regimes and formulas."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,14 +23,14 @@ from imu_calibration.selection.questions import TEMPERATURE_SPAN
 BLOCK = 0.25
 """Least length of a block of a moving window, s; at rest a window is one block."""
 MOST_BLOCKS = 1200
-"""Blocks of one recording, about: their covariance is factored whole."""
+"""Blocks of one recording, about: their full covariance is factored."""
 WITHIN = 5
-"""Rows at which the columns of a block are taken."""
+"""Rows at which the columns of a block are evaluated."""
 
 
 @dataclass(frozen=True, eq=False)
 class RestBlocks:
-    """Means over blocks of one sensor's residual and of the columns of everything that was asked."""
+    """Means over blocks of one sensor's residual and of the columns of all candidate effects."""
 
     sensor: str
     """'accelerometer' or 'gyroscope'."""
@@ -43,7 +43,7 @@ class RestBlocks:
     window: np.ndarray
     """Number of the window of each block, shape (b,)."""
     locked: np.ndarray
-    """Whether its window takes no part in choosing, shape (b,)."""
+    """Mask of blocks in locked windows, shape (b,)."""
     design: tuple
     """Per axis ``[columns of the parameters that act on it | residual]``, shape (b, q_a + 1)."""
     index: tuple
@@ -64,7 +64,7 @@ class RestBlocks:
         return np.add.reduceat(rows, self.starts, axis=0) / counts.reshape(-1, *[1] * (rows.ndim - 1))
 
     def whitener(self, select: np.ndarray) -> 'BlockWhitener':
-        """Return what makes the blocks `select` (mask) independent, of unit variance."""
+        """Return the whitener of the blocks `select` (mask): independent, of unit variance."""
         return BlockWhitener(self, select)
 
 
@@ -81,7 +81,7 @@ class BlockWhitener:
         self._factor, self._select = np.linalg.cholesky(covariance), select
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """Return whitened rows, shape as what was selected; divide by ``scale[axis]`` for an axis."""
+        """Return whitened rows, shape of the selection; divide by ``scale[axis]`` for an axis."""
         return solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False)
 
 
@@ -92,12 +92,12 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
     Parameters
     ----------
     windows : sequence of Window
-        Those that were fitted to, in order.
+        Windows of the fit, in order.
     table : Table
     attempt : Attempt
-        The linearisation whose columns are meant.
+        The linearisation of the columns.
     explained : Explained
-        What noise alone leaves.
+        Expected loss from noise.
 
     """
     length = max(BLOCK, sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1) / MOST_BLOCKS)
@@ -121,14 +121,14 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
         floor = explained.floor.noise[sensor]
         busier = _busier(windows, sensor, floor, attempt.recording.kind[which], ~attempt.locked[which])
         variance = floor.low_variance * busier[place] / count[:, None]
-        # A step, or what heats up, is a wander to a filter that has learnt from it: the place is sought beside what every bias does.
+        # An estimated bias process would absorb a step or a warm-up; regimes are searched with the least bias processes.
         processes = natural_processes(floor, attempt.recording.period)
         found[sensor] = _of_sensor(sensor, attempt, references, table, mean, common, variance, processes)
     return found
 
 
 def _some(windows, length):
-    """Return the numbers of the windows that are looked at: all, or of a long recording a part drawn by chance, in order."""
+    """Return the numbers of the windows in use: all, or a random part of a long recording, in order."""
     blocks = sum(1 if len(w.motion) == 1 else max(1, round((w.time[-1] - w.time[0]) / length)) for w in windows)
     if blocks <= 2 * MOST_BLOCKS:
         return np.arange(len(windows))
@@ -139,8 +139,8 @@ def _busier(windows, sensor, floor, kinds, judged):
     """
     Return by how much each window's white noise exceeds that at rest, shape (k, 3).
 
-    By kind, from second differences of the windows `judged` (mask), in which a cause that goes with the motion hardly shows; at most what
-    its misfit allows.
+    By kind, from second differences of the windows `judged` (mask), which suppress causes that vary with the motion; at most
+    the misfit of the kind.
     """
     place = SENSORS.index(sensor)
     found = np.ones((len(windows), 3))
@@ -180,7 +180,7 @@ class _Cut:
     edges: np.ndarray
     """First sample of each block, and the number of samples."""
     rows: np.ndarray
-    """Rows of the motion that are taken."""
+    """Rows of the motion in use."""
     per_block: np.ndarray
     """Number of them in each block."""
 

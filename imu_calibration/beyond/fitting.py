@@ -1,4 +1,4 @@
-"""What a choice of columns leaves in blocks: fitted to the windows that choose, judged on the locked ones."""
+"""Residual of a choice of columns in blocks: fitted to the selection windows, evaluated on the locked ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,17 +10,17 @@ from imu_calibration.effects.base import AXES
 from imu_calibration.estimation.scaled_solve import solve_normal
 
 WIDE = 1e6
-"""Prior standard deviations of amplitudes, in what makes one standard deviation of noise in all blocks."""
+"""Prior sd of amplitudes; unit: the amplitude that equals one standard deviation of noise in all blocks."""
 RESAMPLES = 500
 LEAST_OF_AXIS = 0.1
-"""Share of the strongest axis' squares from which another axis carries a rest too."""
+"""Share of the strongest axis' squares from which another axis has an excess too."""
 ABOVE_NOISE = 3.0
-"""Standard deviations above noise that it has then."""
+"""Least excess of this axis over noise, standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
 class BlockFit:
-    """A model and further columns, fitted to the windows that choose."""
+    """A model and further columns, fitted to the selection windows."""
 
     amplitudes: np.ndarray
     """Of the further columns, shape (k, 3)."""
@@ -33,7 +33,7 @@ class BlockFit:
 
     @property
     def excess(self) -> float:
-        """Sum of squares of the locked blocks above what noise leaves."""
+        """Sum of squares of the locked blocks above the expectation from noise."""
         return float((self.rest**2 - 1.0).sum())
 
 
@@ -78,7 +78,7 @@ class BlockFits:
         return BlockFit(amplitudes, sds, np.stack(rests, axis=1), self.blocks.window[self.blocks.locked])
 
     def axes(self) -> tuple[str, ...]:
-        """Return the axes that carry what the model leaves, the strongest first: in the windows that choose, in plain squares."""
+        """Return the axes with an excess in the selection windows, in order of unweighted squares, the largest first."""
         excess = self._excess()
         noise = ABOVE_NOISE * np.sqrt(2.0 * (~self.blocks.locked).sum())
         squares = excess * np.median(self.blocks.variance[~self.blocks.locked], axis=0)
@@ -87,11 +87,11 @@ class BlockFits:
 
     @property
     def sigma(self) -> float:
-        """Standard deviations by which what the model leaves in the windows that choose exceeds noise, all axes."""
+        """Excess of the residual over noise in the selection windows, all axes, standard deviations."""
         return float(self._excess().sum() / np.sqrt(6.0 * (~self.blocks.locked).sum()))
 
     def _excess(self):
-        """Return the sums of squares above what noise leaves in the windows that choose, shape (3,)."""
+        """Return the sums of squares above the expectation from noise in the selection windows, shape (3,)."""
         excess = np.zeros(3)
         for axis in range(3):
             rows = self._rows(0, axis, self._at[axis], None)

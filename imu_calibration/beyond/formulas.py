@@ -1,4 +1,4 @@
-"""Which formula of the grammar explains the rest of a sensor, chosen on the windows that choose and judged on those that do not."""
+"""The formula of the grammar that explains the residual of a sensor, chosen on selection windows and evaluated on locked windows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,23 +15,23 @@ from imu_calibration.reference.reference_motion import Reference
 from imu_calibration.selection.search import FAMILY_WISE, TIE
 
 NEW = 1e-3
-"""Least share of a column's size that nothing of the catalogue can make, for the recording to say anything of it."""
+"""Least share of a column's size outside the span of the catalogue for a test of it."""
 CHUNK = 128
 """Columns that are worked out at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class FormulaChoice:
-    """One formula with what speaks for it."""
+    """One formula with its evidence."""
 
     formula: Formula
-    """What was tried."""
+    """The candidate."""
     columns: np.ndarray
     """Means over the blocks, shape (b, k, 3): the last index is the axis it acts on."""
     p_value: float
-    """Chance of such a fall of the misfit by noise, times the number of formulas."""
+    """Probability of such a reduction of the misfit by noise, times the number of formulas."""
     alike: tuple[Formula, ...]
-    """Formulas that the recording cannot tell apart from it, the likeliest first."""
+    """Formulas that are not separable from it, the likeliest first."""
 
 
 @lru_cache(maxsize=64)
@@ -41,7 +41,7 @@ def _function(texts):
 
 class FormulaSearch:
     """
-    Formulas on one sensor's blocks, with baseline and catalogue taken out as far as they are plausible.
+    Formulas on one sensor's blocks, with baseline and catalogue projected out up to plausible sizes.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class FormulaSearch:
         for axis in range(3):
             part = every[:, ends[axis]:ends[axis + 1]] / whiten.scale[axis]
             left, sizes = svd(part[:, :-1] @ plausible[blocks.index[axis]], full_matrices=False, lapack_driver='gesdd')[:2]
-            # What the catalogue could plausibly make counts as noise: a direction keeps what exceeds its plausible size.
+            # Plausible contributions of the catalogue count as noise: a direction keeps the excess over its plausible size.
             basis, damped = left, (1.0 - 1.0 / np.sqrt(1.0 + sizes**2))[:, None]
             columns = every[:, ends[3]:] / whiten.scale[axis]
             self._rest.append(part[:, -1] - basis @ (damped[:, 0] * (basis.T @ part[:, -1])))
@@ -86,7 +86,7 @@ class FormulaSearch:
 
     @property
     def misfit(self) -> float:
-        """Chi-square per degree of freedom of what nothing of the catalogue explains, at least 1."""
+        """Chi-square per degree of freedom of the part outside the catalogue, at least 1."""
         dof = max(3 * len(self._rest[0]) - sum(self.known), 1)
         return max(sum(float(rest @ rest) for rest in self._rest) / dof, 1.0)
 
@@ -111,7 +111,7 @@ class FormulaSearch:
         return np.stack([self.means[:, self._at(column)] for column in formula.columns], axis=1)
 
     def take(self, choice: FormulaChoice) -> None:
-        """Project a choice out, so that the next is asked beside it."""
+        """Project a choice out, so that the next is tested conditional on it."""
         for axis in range(3):
             columns = self._free[axis][:, [self._at(column)[axis] for column in choice.formula.columns]]
             basis, sizes = svd(columns, full_matrices=False)[:2]
@@ -150,7 +150,7 @@ def _three(column):
 
 
 def _values(ref: Reference, reference_temperature: float) -> dict:
-    """Return what the names of a formula stand for."""
+    """Return the values of the names in a formula."""
     values = {'time': ref.time, 'temperature_ref_c': np.float64(reference_temperature)}
     if ref.temperature_c is not None:
         values['temperature_c'] = ref.temperature_c

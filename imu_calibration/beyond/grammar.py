@@ -9,14 +9,14 @@ from imu_calibration.effects.base import AXES
 from imu_calibration.effects.expressions import FUNCTIONS, QUANTITY_OF, names_in, read
 
 ORDERS, PAIR_ORDERS, FEW_ORDERS = range(1, 9), range(1, 7), range(1, 4)
-"""Harmonics per turn: of one joint, of two joints at once, of a joint times something else."""
+"""Harmonics per turn: of one joint, of two joints at once, of a joint times another quantity."""
 CONSTANTS = (0.07, 0.2, 0.6)
-"""Time constants of what settles, as shares of the recording."""
+"""Time constants of settling, as shares of the recording."""
 SOFT_SIGN = 'tanh({} / 0.005)'
 """The sense of a rate changes over 0.3 deg/s: at rest a sign is that of the Earth's rate or of noise, and would shake the bias there."""
 WARMTH = '(temperature_c - temperature_ref_c)'
 UNIT_OF = {'force': 'm/s^2', 'rate': 'rad/s', 'angular acceleration': 'rad/s^2', 'temperature': 'K', 'joint rate': 'rad/s', 'time': 's'}
-"""Quantity -> unit that one factor of it has; angles, attitudes and what stands inside a function have none."""
+"""Quantity -> unit of one factor of it; angles, attitudes and arguments of functions have none."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Formula:
 
     @property
     def family(self) -> frozenset[str]:
-        """Quantities that it speaks of."""
+        """Quantities in it."""
         texts = [text for column in self.columns for text in ((column,) if isinstance(column, str) else column)]
         return frozenset(QUANTITY_OF[name] for text in texts for name in names_in(read(text))) - {'reference temperature'}
 
@@ -43,7 +43,7 @@ class Formula:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """What a simpler formula has less of: columns; factors and functions."""
+        """Measure of complexity: columns; factors and functions."""
         text = str(self.columns[0])
         return len(self.columns), len(self.factors) + sum(text.count(f'{name}(') for name in FUNCTIONS)
 
@@ -65,9 +65,9 @@ def grammar(n_joints: int, thermal: bool, duration: float) -> tuple[Formula, ...
     """
     Return the formulas that are tried.
 
-    Products of up to three of specific force and rate; angular acceleration, magnitudes and signs with one more factor; all that times the
-    temperature and times what settles; harmonics of the joints, alone, of two joints, times the joint's rate, the temperature, or what the
-    sensor feels; and vectors that stay with the table while the sensor turns.
+    Products of up to three of specific force and rate; angular acceleration, magnitudes and signs with one more factor; all of these times
+    the temperature and times settling; harmonics of one joint, of two joints, times the joint's rate, the temperature, or the sensor's
+    input; and vectors fixed to the table while the sensor turns.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def _of_joint_rates(n_joints):
 
 
 def _with_the_table(n_joints, thermal):
-    """Yield vectors that stay with the level frame while the sensor turns."""
+    """Yield vectors fixed to the level frame while the sensor turns."""
     joints = range(1, n_joints + 1)
     vectors = [[f'c_{axis}{level}' for axis in AXES] for level in AXES]
     befores = [('', ())] + [(f'{WARMTH} * ', ('temperature',))] * thermal

@@ -1,4 +1,4 @@
-"""The question that `calibrate` and `diagnose` share: what a recording asks for, without names that a formula or a place does without."""
+"""The search of `calibrate` and `diagnose`: supported effects, without findings that a formula or a regime replaces."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -20,14 +20,14 @@ from imu_calibration.selection.investigation import Investigation, investigate
 from imu_calibration.selection.questions import Question
 
 CLEAR = 10.0
-"""Standard deviations above noise at rest from which moving blocks are asked for a formula."""
+"""Standard deviations above noise at rest from which a formula is searched in moving blocks."""
 NOT_NEEDED = 0.05
-"""Share of what a finding takes off the rest that it must still take off beside a formula or a place."""
+"""Least share of a finding's reduction of the residual that must remain with a formula or a regime in the model."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Examination(Investigation):
-    """An Investigation with what its findings leave in each sensor: worked out when first asked for, once."""
+    """An Investigation with the residual analysis of each sensor, evaluated lazily and cached."""
 
     table: Table
     """The reference."""
@@ -36,7 +36,7 @@ class Examination(Investigation):
 
     @classmethod
     def of(cls, found: Investigation, table: Table) -> 'Examination':
-        """Return an Investigation as an Examination; one that is stays itself."""
+        """Return an Investigation as an Examination; an Examination is returned unchanged."""
         return found if isinstance(found, cls) else cls(**{each.name: getattr(found, each.name) for each in fields(found)}, table=table)
 
     @cached_property
@@ -58,15 +58,15 @@ class Examination(Investigation):
         return self._fits[sensor, used]
 
     def regimes(self, sensor: str, chosen: Sequence[Question] | None = None) -> list[RestRegime]:
-        """Return where the rest of a sensor sits beside a choice, beside the findings where not given (`find_regimes`)."""
+        """Return the regimes of a sensor's residual with a choice in the model; default: the findings (`find_regimes`)."""
         return find_regimes(self.blocks[sensor], self.attempt, self.search.used(self.named if chosen is None else chosen),
                             joint_names=self.table.joint_names)
 
     def proposal(self, sensor: str) -> Proposal | None:
         """
-        Return a formula for what the findings leave in a sensor, where that is significant or clear within moving windows.
+        Return a formula for the residual of a sensor, where it is significant or clear within moving windows.
 
-        What changes within moving windows passes for their noise; a formula that takes it away shows that it is none.
+        Variation within moving windows is modelled as noise; a formula that explains it shows that it is deterministic.
         """
         if sensor not in self._proposals:
             fits = self.fits(sensor)
@@ -75,7 +75,7 @@ class Examination(Investigation):
         return self._proposals[sensor]
 
     def without(self, gone: Sequence[Question]) -> 'Examination':
-        """Return the Examination without some findings; they stay doubtful, and widen what is said of the others."""
+        """Return the Examination without some findings; they remain doubtful, and widen the uncertainty of all other ones."""
         names = {question.name for question in gone}
         other = replace(self, named=[question for question in self.named if question not in gone], doubtful=[*self.doubtful, *gone],
                         rivals=[rival for rival in self.rivals if rival.question.name not in names])
@@ -86,7 +86,7 @@ class Examination(Investigation):
 def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
             bias_processes: dict | None = None) -> Examination:
     """
-    Ask every effect that a model lacks (`investigate`), and withdraw what a formula or a place does without.
+    Test every effect that a model lacks (`investigate`), and withdraw findings that a formula or a regime replaces.
 
     Parameters
     ----------
@@ -111,19 +111,19 @@ def without_superseded(found: Examination) -> Examination:
 
 def superseded(found: Examination) -> list[Question]:
     """
-    Return the findings that a formula or a place does without: they stood in for the part of it that looks like them.
+    Return the findings that a formula or a regime replaces: they approximated the part that correlates with them.
 
-    A response to the cube of a force is three quarters a response to the force, and the rest of it alone would be told as a formula beside
-    a wrong name; a step when it is warm looks like a curve of the temperature. So each finding is left out once, in all sensors on which
-    it acts, and counts where the windows held out miss it beside what stands in for it: the formula of what all findings leave, one of what
-    is left without it, or the places of that. That is asked where a finding leaves a rest; of what follows the temperature always: what
-    settles, or steps, while the sensor warms up looks like it so well that hardly a rest stays.
+    A response to the cube of a force is three quarters a response to the force; its residual would be reported as a formula in addition to
+    a wrong effect; a step at warm temperature is like a polynomial of the temperature. So each finding is omitted once, in all sensors on
+    which it acts, and is kept if held-out windows need it in addition to the substitute: the formula for the residual of all findings, a
+    formula for the residual without it, or the regimes of that. This is tested where a residual remains; for effects of the temperature
+    always: settling or a step during the warm-up is so similar that hardly any residual remains.
     """
     return [question for question in found.named if _done_without(found, question)]
 
 
 def _done_without(found, question):
-    """Return whether a finding takes hardly anything off the rest of its sensors beside what stands in for it in some of them."""
+    """Return whether a finding hardly reduces the residual of its sensors with a substitute in some of them."""
     sensors = sensors_of(question.effect)
     warm = 'temperature' in question.effect.needs
     asked = [sensor for sensor in sensors if warm or found.rests[sensor].significant or found.proposal(sensor)]
@@ -157,7 +157,7 @@ def _columns(found, sensor, proposal):
 
 
 def _places(found, sensor, chosen):
-    """Return a column that is one where an offset takes most of what a choice leaves in an axis, shape (b, 1, 3), or None."""
+    """Return an indicator column of the regimes where an offset explains most of an axis' residual, shape (b, 1, 3), or None."""
     offsets = [regime for regime in found.regimes(sensor, chosen) if regime.offset and regime.share >= MOST_OF_IT]
     first = {regime.axis: regime.inside for regime in reversed(offsets)}
     nowhere = np.zeros(len(found.blocks[sensor].time))

@@ -1,4 +1,4 @@
-"""Looking beyond the catalogue: for each sensor with a rest, where it sits and what formula it follows."""
+"""Analysis beyond the catalogue: regimes and a formula for each sensor with a significant residual."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from imu_calibration.beyond.unexplained import Unexplained
 
 
 def look_beyond(found: Examination) -> dict[str, Unexplained]:
-    """Return sensor -> what stays unexplained with its tones, and with regimes and a proposal where a rest is significant."""
+    """Return sensor -> the unexplained excess with its tones, and with regimes and a proposal where it is significant."""
     tones = find_tones(found, found.table)
     looked = {sensor: replace(rest, tones=tones[sensor]) for sensor, rest in found.rests.items()}
     for sensor, rest in looked.items():

@@ -1,4 +1,4 @@
-"""Whole orders of a joint's turn: tones that keep their phase on the joint, in spins and in swings alike."""
+"""Integer orders of a joint's turn: tones with a constant phase on the joint, in spins and in swings."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,15 +9,15 @@ from imu_calibration.chances import f_sf
 from imu_calibration.segmentation.window import Window
 
 LOWEST, HIGHEST_ORDER = 4, 64
-"""Orders that are asked about; lower ones are formulas."""
+"""Orders under test; lower ones are formulas."""
 PIECE_S = 2.0
-"""Length of the pieces whose phases are compared, s."""
+"""Length of the pieces for comparison of phases, s."""
 LEAST_CYCLES = 1.5
 """Of an order in a piece that can show it: less is a slope or a curve."""
 LEAST_PIECES = 8
-"""Fewer pieces do not show what noise scatters."""
+"""Least number of pieces for an estimate of the scatter."""
 OUT = 10.0
-"""Power of an order over the median of all orders, from which it stands out: what repeats with the motion has all of them."""
+"""Least power of an order over the median of all orders; residuals that repeat with the motion have all orders."""
 IN_PHASE = 0.5
 """Cosine of the angle within which a window is in phase."""
 MOST = 0.75
@@ -25,31 +25,31 @@ MOST = 0.75
 SHORTEST_CYCLE = 2.2
 """Samples per cycle, at least."""
 FEWEST_SAMPLES = 16
-"""Of a window, or of equal steps of a turning joint, that are taken apart into frequencies."""
+"""Least number of samples of a window, or of equal steps of a turning joint, for a spectrum."""
 
 
 @dataclass(frozen=True, eq=False)
 class Orders:
-    """What each order of one joint has in the three axes of a rest."""
+    """Amplitudes of the orders of one joint in the three axes of a residual."""
 
     order: np.ndarray
     """Cycles per turn, shape (k,)."""
     amplitude: np.ndarray
     """Of the wave that keeps its phase, in the unit of the rest, shape (k, 3)."""
     p_value: np.ndarray
-    """Chance that noise, whose phase is another in every piece, gives as much; shape (k, 3)."""
+    """Probability by noise, with a random phase in every piece; shape (k, 3)."""
     power: np.ndarray
     """Squared amplitude over the median of all orders, shape (k, 3)."""
     share: np.ndarray
-    """Share of the windows whose phase is within 60 degrees of it, shape (k, 3)."""
+    """Share of the windows with a phase within 60 degrees of it, shape (k, 3)."""
 
 
 def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int) -> Orders | None:
     """
     Return the orders of a joint in a rest, or None where too little turns.
 
-    The rest of each piece of two seconds, without what is linear in time or quadratic in the angle, is projected on exp(-i k angle). The
-    sums of all pieces add up for what is fixed to the joint, whichever way it turns; noise, hum and what a motion does add up to nothing.
+    The residual of each piece of two seconds, without terms linear in time or quadratic in the angle, is projected on exp(-i k angle). The
+    pieces add coherently for tones fixed to the joint, in either direction; noise, hum and effects of the motion cancel.
     Over the scatter of the pieces this is Hotelling's T² with two degrees of freedom.
 
     Parameters
@@ -84,7 +84,7 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
 
 
 def _alike(number, sums, weight, wave):
-    """Return the share of the windows in phase with a wave: what each motion does in a phase of its own repeats in all of its pieces."""
+    """Return the share of the windows in phase with a wave; effects of a motion have the same phase in all of its pieces only."""
     starts = np.flatnonzero(np.diff(number, prepend=-1))
     each, known = np.add.reduceat(sums, starts), np.add.reduceat(weight, starts) > 0
     in_phase = (each * wave.conj()).real > IN_PHASE * np.abs(each) * np.abs(wave)
@@ -92,7 +92,7 @@ def _alike(number, sums, weight, wave):
 
 
 def long_enough(windows: Sequence[Window], rests: Sequence[np.ndarray], *, with_joints: bool) -> Iterator[tuple[int, Window, np.ndarray]]:
-    """Yield (number, window, rest) of the windows that have enough samples for a spectrum, and the joints at each of them where asked."""
+    """Yield (number, window, rest) of the windows that have enough samples for a spectrum, optionally with the joints at each of them."""
     for place, (window, rest) in enumerate(zip(windows, rests)):
         if len(window) >= FEWEST_SAMPLES and (not with_joints or len(window.motion) == len(window)):
             yield place, window, rest

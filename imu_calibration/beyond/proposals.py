@@ -1,4 +1,4 @@
-"""A formula for what stays unexplained: found, judged on windows held out, put into words and into a term that a model can hold."""
+"""A formula for the unexplained residual: search, test on held-out windows, description and a term for a model."""
 
 from dataclasses import dataclass, field
 
@@ -16,23 +16,23 @@ from imu_calibration.selection.explained_share import LEAST_SHARE_SMOOTH
 from imu_calibration.units import for_people, with_sd
 
 LEAST_SHARE = 0.6
-"""Share of the rest that a formula removes from held-out windows at least; less is a story."""
+"""Share of the excess that a formula removes from held-out windows at least."""
 WORTH_A_SECOND = 0.1
 """Share that a second formula adds at least."""
 MOST_TERMS = 2
 ONE_SHAPE = 0.9
-"""Share of a formula's amplitudes, all axes, that one shape must hold to stand for all of it."""
+"""Share of a formula's amplitudes, all axes, that one shape must have to replace all of it."""
 OTHER_SENSOR = 3.0
-"""Standard deviations by which a cause of the table may differ from what the other sensor says of it."""
+"""Standard deviations by which a cause of the table may differ from the estimate of the other sensor."""
 SHOWN_ALIKE = 3
-"""Formulas of a class that are told."""
+"""Largest number of reported formulas of a class."""
 SEEN = 4.0
 """Standard deviations from which an axis counts as concerned."""
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """Formulas that explain most of what no effect of the catalogue explains in a sensor."""
+    """Formulas that explain most of a sensor's residual outside the catalogue."""
 
     sensor: str
     """'accelerometer' or 'gyroscope'."""
@@ -43,7 +43,7 @@ class Proposal:
     sds: tuple[np.ndarray, ...]
     """Standard deviations, with the misfit in them."""
     family: frozenset[str]
-    """Quantities that they speak of."""
+    """Quantities in them."""
     axes: tuple[str, ...]
     """Axes of the sensor on which they show."""
     share: float
@@ -53,13 +53,13 @@ class Proposal:
     reduction: float
     """By how much the rms beyond noise falls there, as a share."""
     p_value: float
-    """Chance of the first by noise, times the number of formulas."""
+    """Probability of the first by noise, times the number of formulas."""
     alike: tuple[str, ...]
-    """Formulas that this recording cannot tell apart from the first."""
+    """Formulas that are not separable from the first in this recording."""
     nearest: tuple[str, float] | None
-    """Effect of the catalogue that comes nearest, and the share that it removes."""
+    """Effect of the catalogue that fits best, and the share that it removes."""
     motion: str
-    """What would confirm it."""
+    """A motion that would confirm it."""
     sizes: tuple[float, ...] = field(default=())
     """Rms of each formula's contribution over the recording, m/s^2 or rad/s."""
 
@@ -70,7 +70,7 @@ class Proposal:
 
     @property
     def sentence(self) -> str:
-        """What is proposed, in words."""
+        """Description of the proposal."""
         parts = [f'{_size(effect, value, sd)}' for effect, value, sd in zip(self.effects, self.values, self.sds)]
         text = (f'{100 * self.share:.0f} % of it ({100 * self.ci95[0]:.0f} to {100 * self.ci95[1]:.0f} %, on windows held out) follows '
                 + ' and '.join(f'{column}, {part}' for column, part in zip(self.columns, parts)))
@@ -95,10 +95,10 @@ class Proposal:
 
 def propose(blocks: RestBlocks, attempt: Attempt, fits: BlockFits) -> Proposal | None:
     """
-    Return a Proposal for what the chosen effects leave of a sensor, or None where no formula removes most of it.
+    Return a Proposal for the residual of a sensor with the chosen effects, or None where no formula removes most of it.
 
-    Formulas are chosen on the windows that choose, with everything that the catalogue could plausibly make projected out; the share is
-    that of the locked windows beside the model that was found, and both halves of the choosing windows must show the same.
+    Formulas are chosen on the selection windows, with all plausible contributions of the catalogue projected out; the share is
+    from the locked windows with the findings in the model, and both halves of the selection windows must agree.
     """
     search = FormulaSearch(blocks, _grammar(blocks), _plausible(blocks.sensor, attempt),
                            reference_temperature=attempt.recording.model.temperature_ref_c)
@@ -126,7 +126,7 @@ def _plausible(sensor, attempt):
     """
     Return a factor of the covariance that the catalogue's parameters may have, shape (q, q).
 
-    What the table does the other sensor sees too: it may explain no more here than it is allowed there.
+    A cause in the table acts on both sensors: its explained share here is limited by its estimate there.
     """
     plausible = np.diag(attempt.space.prior_sd)
     other = next(each for each in SENSORS if each != sensor)
@@ -148,7 +148,7 @@ def _joined(choices):
 
 
 def _stable(fits, choices):
-    """Return whether the halves of the recording agree on the last choice, as far as they show it."""
+    """Return whether the halves of the recording agree on the last choice within their precision."""
     width = choices[-1].columns.shape[1]
     early, late, whole = (fits.fit(_joined(choices), half=half) for half in (0, 1, None))
     apart = ((early.amplitudes - late.amplitudes) / np.sqrt(early.sd**2 + late.sd**2))[-width:]
@@ -249,7 +249,7 @@ def _motion(effects):
 
 
 def _nearest(fits: BlockFits, plain: BlockFit, attempt: Attempt) -> tuple[str, float] | None:
-    """Return (effect, share removed) of what comes nearest in the catalogue."""
+    """Return (effect, share removed) of the best fit in the catalogue."""
     best: tuple[str, float] | None = None
     for question in attempt.questions:
         if set(question.parameters) <= fits.used or not any(np.isin(question.parameters, index).any() for index in fits.blocks.index):

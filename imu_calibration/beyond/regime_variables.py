@@ -1,4 +1,4 @@
-"""What the rest of a sensor may go by: angles, rates and sides of the joints, speed, force, time, temperature, in ranges of values."""
+"""Variables of regimes: angles, rates and sides of the joints, speed, force, time, temperature, in ranges of values."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ MOST_BOUNDS = 16
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """What a regime may go by: a bin for each block, and the words for a range of values."""
+    """A variable of regimes: a bin for each block, and the description of a range of values."""
 
     name: str
     bins: np.ndarray
@@ -40,7 +40,7 @@ class Variable:
         return (float(self.edges[chosen[0]]), float(self.edges[chosen[-1] + 1])) if len(self.edges) else None
 
     def inside(self, low: float, high: float) -> np.ndarray:
-        """Return the blocks whose value lies between two bounds, the last one open at the end of all, shape (b,)."""
+        """Return the mask of blocks with a value between two bounds, the last range open at its end, shape (b,)."""
         if self.cyclic:
             return (self.values - low) % 360.0 < ((high - low) % 360.0 or 360.0)
         return ((self.values >= low) | (low <= self.edges[0])) & ((self.values < high) | (high >= self.edges[-1]))
@@ -59,7 +59,7 @@ class Variable:
 
 
 def variables_of(blocks: RestBlocks, joint_names: Sequence[str]) -> list[Variable]:
-    """Return what a regime may go by in this recording; of those that do as well the first is told."""
+    """Return the variables of regimes in this recording; the first is reported among equals."""
     ref, found = blocks.ref, []
     angles, rates = blocks.means(ref.joint_angle), blocks.means(ref.joint_rate)
     for k, name in enumerate(joint_names):
@@ -85,7 +85,7 @@ def variables_of(blocks: RestBlocks, joint_names: Sequence[str]) -> list[Variabl
 
 
 def _before_rest(name, rate):
-    """Return whether a joint came to a rest from one side or the other."""
+    """Return from which side a joint reached its rest."""
     moving = np.abs(rate) > 0.5 * DEG
     side = np.where(moving, np.sign(rate), 0.0)
     place = np.maximum.accumulate(np.where(moving, np.arange(len(rate)), -1))
@@ -105,7 +105,7 @@ def _cyclic(name, degrees):
 
 
 def ranged(name: str, values: np.ndarray, unit: str, *, least: float = 1e-3) -> list[Variable]:
-    """Return the variable of a value of each block in bins of as many blocks, or none where it hardly changes."""
+    """Return the variable of a value of each block in bins of equal numbers of blocks, or none where it hardly changes."""
     edges = np.unique(np.round(np.quantile(values, np.linspace(0.0, 1.0, N_BINS + 1)), 3))
     if len(edges) < 4 or np.ptp(edges) < least:
         return []

@@ -1,4 +1,4 @@
-"""Where the rest of a sensor sits: regimes of the motion in which most of it lies, found on some windows and tested on others."""
+"""Regimes of the motion that contain most of a sensor's residual, found on every other window and tested on the remaining ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from imu_calibration.effects.base import AXES
 from imu_calibration.selection.attempt import Attempt
 
 FALSE_DISCOVERIES = 0.05
-"""Share of false regimes among those told."""
+"""False discovery rate of reported regimes."""
 MOST_OF_IT, MUCH_OF_IT = 0.8, 0.5
-"""Share of the rest that lies in a regime, and that an offset in it takes away, which bins of finite width make smaller."""
+"""Least share of the excess in a regime, and least share that an offset in it removes, which the bin width reduces."""
 NEARLY_ALL = 0.95
-"""Share of what scatters in a range that the part of it which is told holds."""
+"""Share of the scatter of a range in its reported part."""
 ALIKE = 16.0
-"""Twice the nats that a place may be less likely than another and still be told first, as it was asked first: joints before the sensor."""
+"""Twice the difference of log likelihood, nats, up to which the order of variables decides: joints before the sensor."""
 WIDEST = 0.6
-"""Share of the blocks that a regime may hold: what is everywhere is nowhere."""
+"""Largest share of the blocks in a regime; a larger one does not localise the residual."""
 TINY = 1e-9
 """Keeps columns that a part of the recording does not have from making a system singular."""
 
@@ -34,21 +34,21 @@ class RestRegime:
     axis: str
     """Axis of the sensor; 'norm' where only the length of its output is known."""
     variable: str
-    """What it goes by: 'angle of NAME', 'rate of NAME', 'time', ..."""
+    """Variable: 'angle of NAME', 'rate of NAME', 'time', ..."""
     text: str
-    """The condition in words."""
+    """Description of the condition."""
     share: float
     """Share of the axis' rest that lies in it, on windows that it was not found on."""
     p_value: float
-    """Chance of the contrast there by noise."""
+    """Probability of the contrast by noise."""
     inside: np.ndarray
     """Whether each block lies in it, shape (b,)."""
     time: np.ndarray
     """Middle of each block, s, shape (b,)."""
     offset: bool
-    """Whether the output differs by an offset there, rather than by something that changes; then it could as well be everywhere else."""
+    """Whether the output differs by a constant offset there; the complement could then have it as well."""
     cost: float
-    """Minus twice the log likelihood of the windows that it was not found on: the smallest is told first."""
+    """Minus twice the log likelihood of the test windows: the smallest is reported first."""
     bounds: tuple[float, float] | None
     """Where it begins and ends, SI or degrees for angles; an angle may begin beyond where it ends."""
     bins: tuple = ()
@@ -64,11 +64,11 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
     """
     Return the regimes of a sensor's axes, the clearest of each axis first.
 
-    For every variable and every range of it either the model is fitted to the blocks outside and those inside scatter by themselves, or
-    those inside have an offset of their own; the likeliest range is found on every other window and tested on those between, by an F test
-    whose degrees of freedom count windows. Of all tests the false discoveries are held at 5 %. Where an offset
-    begins and ends is sharpened on all windows to between blocks, p-values times the places tried: one window on the wrong side of a step
-    hides all of it. Of what scatters the shortest part that holds nearly all is told.
+    For every range of every variable either the model is fitted outside and the blocks inside have additional scatter, or the blocks
+    inside have a separate offset. The likeliest range is found on every other window and tested on the remaining ones, by an F test with
+    windows as degrees of freedom. The false discovery rate of all tests is 5 %. The bounds of an offset
+    are refined on all windows to between blocks, with p-values times the number of trials: one window on the wrong side of a step
+    hides all of it. For scatter the shortest part with nearly all of it is reported.
     """
     variables = variables_of(blocks, joint_names)
     white = blocks.whitener(np.ones(len(blocks.time), bool))
@@ -81,16 +81,16 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
 
 
 def _few_false(p_values):
-    """Return the p-value up to which discoveries are told (Benjamini, Hochberg 1995)."""
+    """Return the p-value up to which regimes are reported (Benjamini, Hochberg 1995)."""
     order = np.sort(p_values)
     return max(order[order <= FALSE_DISCOVERIES * np.arange(1, len(order) + 1) / max(len(order), 1)], default=-1.0)
 
 
 def _likeliest_first(regimes):
     """
-    Return the regimes of an axis in order; of those that are nearly as likely as the likeliest the one that was asked first.
+    Return the regimes of an axis in order; among nearly equal likelihoods the first variable precedes.
 
-    What scatters is told where no offset takes most of it: an offset says how, too.
+    Scatter is reported only where no offset explains most of it.
     """
     if any(regime.offset and regime.share >= MOST_OF_IT for regime in regimes):
         regimes = [regime for regime in regimes if regime.offset]
@@ -162,7 +162,7 @@ class _AxisRest:
         """
         Return a regime of another offset with bounds between blocks: the likeliest of some about the edges of its bins.
 
-        Where the windows that it was not found on do not say so too the edges stay.
+        Unless the test windows confirm them the edges are unchanged.
         """
         bounds, tried = regime.bounds, 1
         for end in (0, 1) if bounds and regime.offset else ():
@@ -195,7 +195,7 @@ def _tested_scatter(left, inside, outside, windows):
 
 def tested_offset(rows: np.ndarray, mark: np.ndarray, prior: tuple, *, n_windows: int) -> tuple[float, float]:
     """
-    Return (share of the rest that an offset inside takes away, p-value of that).
+    Return (share of the excess that an offset inside removes, its p-value).
 
     Parameters
     ----------
@@ -204,9 +204,9 @@ def tested_offset(rows: np.ndarray, mark: np.ndarray, prior: tuple, *, n_windows
     mark : ndarray, shape (b,)
         The offset's column, made independent as the rows were.
     prior : (ndarray, ndarray)
-        Information and mean that the parameters come with, shape (q,).
+        Prior information and mean of the parameters, shape (q,).
     n_windows : int
-        What counts as degrees of freedom.
+        Number of degrees of freedom.
 
     """
     before = _solved(rows, prior)[1]
@@ -225,7 +225,7 @@ def _for_one_more(prior):
 
 
 def _solved(rows, prior):
-    """Return (values, sum of squares that they leave)."""
+    """Return (values, residual sum of squares)."""
     design = rows[:, :-1]
     values = np.linalg.solve(design.T @ design + np.diag(prior[0] + TINY), design.T @ rows[:, -1] + prior[0] * prior[1])
     return values, float(((rows[:, -1] - design @ values)**2).sum())
@@ -233,9 +233,9 @@ def _solved(rows, prior):
 
 def cleanest(rows: np.ndarray, marks: np.ndarray, prior: tuple, *, bins: np.ndarray, cyclic: bool) -> list[tuple[list[int], bool]]:
     """
-    Return the ranges of bins in order that leave the cleanest rest by likelihood, each with whether it differs by an offset.
+    Return ranges of bins in order of likelihood of the residual outside, each with whether it differs by an offset.
 
-    Either what lies inside scatters by itself, and the model is fitted outside; or it has an offset of its own.
+    Either the blocks inside have additional scatter, and the model is fitted outside; or they have a separate offset.
     """
     count = marks.shape[1]
     parts = np.stack([rows[bins == k].T @ rows[bins == k] for k in range(count)])
@@ -265,7 +265,7 @@ def _energies(inside, outside, prior):
 
 
 def _squares_left(rows, marks, member, prior):
-    """Return the sum of squares that the model and an offset of its own for each range leave, shape (r,)."""
+    """Return the residual sum of squares of the model with a separate offset for each range, shape (r,)."""
     design = rows[:, :-1]
     values, left = _solved(rows, prior)
     inverse = np.linalg.inv(design.T @ design + np.diag(prior[0] + TINY))

@@ -15,22 +15,22 @@ from imu_calibration.selection.investigation import Investigation
 from imu_calibration.units import for_people, significant
 
 STEP = 0.1
-"""Between the frequencies that are asked about, cycles per second or per turn; a stretch is as long as tells two of them apart, at most."""
+"""Spacing of the frequencies under test, cycles per second or per turn; its inverse is the largest length of a stretch."""
 PER_TURN = 128
-"""Places per turn at which a turning joint's rest is taken."""
+"""Angles per turn at which the residual of a turning joint is sampled."""
 LEAST_CYCLES = 3.0
 """Of a tone in a stretch that can show it."""
 HIGHEST = 0.45
 """Highest frequency in that of the samples."""
 CLEAR, BY_CHANCE = 4.0, 0.05
 """
-Power above its surroundings that counts in a stretch, and how often noise reaches it there: e^-4, and more where few frequencies tell what
-is around.
+Least power over its surroundings in a stretch, and its probability by noise: e^-4, and more where few frequencies determine the
+surroundings.
 """
 SIGNIFICANT = 1e-4
-"""Chance of a tone by noise, times the number of frequencies, axes and joints."""
+"""Probability of a tone by noise, times the number of frequencies, axes and joints."""
 MOSTLY = 0.5
-"""Share of the stretches that show a tone, at least: what moves with the motion shows in some of them."""
+"""Least share of the stretches with the tone; effects of the motion occur in some of them only."""
 SLOWEST = 1.0 * DEG
 """A joint that turns slower at times has no orders, rad/s."""
 
@@ -44,23 +44,23 @@ class Tone:
     axis: str
     """Axis of the sensor."""
     joint: str | None
-    """Joint whose turns are counted; None: seconds."""
+    """Joint of the unit 'cycles per turn'; None: seconds."""
     frequency: float
     """Cycles per second, or per turn of the joint."""
     amplitude: float
     """m/s^2 or rad/s."""
     p_value: float
-    """Chance by noise, times the number of what was asked."""
+    """Probability by noise, times the number of tests."""
     share: float
     """Share of the stretches that show it."""
     frequencies: np.ndarray
-    """All frequencies that were asked about, shape (n,)."""
+    """All frequencies under test, shape (n,)."""
     power: np.ndarray
     """Mean power of the axis there, over that around it, shape (n,)."""
 
     @property
     def text(self) -> str:
-        """What it is, in words."""
+        """Description."""
         factor, unit = for_people('m/s^2' if self.sensor == SENSORS[0] else 'rad/s')
         where = f'on {self.sensor} {self.axis}, {significant(self.amplitude * factor, 2)} {unit}'
         if self.joint is None:
@@ -75,12 +75,12 @@ class Tone:
 
 def find_tones(found: Investigation, table: Table) -> dict[str, tuple[Tone, ...]]:
     """
-    Return sensor -> the tones in what is left beside the findings, the surest first.
+    Return sensor -> the tones in the residual of the findings, the most significant first.
 
-    The rest of every stretch of at most ten seconds, or of at most ten turns of a joint that keeps turning, is taken apart into
-    frequencies. One counts where its power is four times the median around it; a tone counts in most stretches, which noise does by chance
-    (binomial law). Rests and motions both tell of seconds; what stays at a multiple of a speed stands still in turns and wanders in
-    seconds. Where few stretches turn, whole orders are looked for in all that the joint does (`beyond.orders`).
+    The residual of every stretch of at most ten seconds, or of at most ten turns of a joint in steady rotation, is transformed to
+    frequencies. A peak has four times the median power around it; a tone has peaks in most stretches, tested against noise
+    (binomial law). Rests and motions are both analysed in seconds; a tone at a multiple of a speed is constant per turn and varies per
+    second. Where few stretches turn, integer orders are searched in all motions of the joint (`beyond.orders`).
     """
     attempt = found.attempt
     values = attempt.values(found.named)[:len(attempt.recording.model.param_names)]
@@ -101,7 +101,7 @@ def find_tones(found: Investigation, table: Table) -> dict[str, tuple[Tone, ...]
 
 
 def _whole(sensor, windows, parts, joint, name) -> Iterator[Tone]:
-    """Yield the Tone of each axis that keeps its phase on a joint and stands out most, where one does."""
+    """Yield the most significant Tone of each axis with a constant phase on a joint, if any."""
     orders = None if joint is None else orders_of(windows, parts, joint)
     if orders is None:
         return
@@ -142,8 +142,8 @@ def _cut(rest, longest):
 
 
 def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float]], joint: str | None) -> Iterator[Tone]:
-    """Yield the Tone of each axis that stands out most, where one does; its p-value counts frequencies only."""
-    from scipy.stats import binom  # here, because it takes long to import
+    """Yield the most significant Tone of each axis, if any; its p-value counts frequencies only."""
+    from scipy.stats import binom  # here, because its import is slow
 
     every = list(stretches)
     if not every:
@@ -165,7 +165,7 @@ def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float
     chance = np.where(hits > MOSTLY * count[:, None], binom.sf(hits - 1, count[:, None], BY_CHANCE) * np.count_nonzero(count), 1.0)
     for axis in range(3):
         mean = ratios[:, axis] / np.maximum(count, 1)
-        # The highest peak among what stands out: what is around it is known by octaves only.
+        # The highest significant peak: the surroundings are known by octaves only.
         best = int(np.argmax(np.where(chance[:, axis] < SIGNIFICANT, plain[:, axis] / np.maximum(count, 1), -1.0)))
         if chance[best, axis] < SIGNIFICANT:
             yield Tone(sensor, AXES[axis], joint, float(grid[best]), float(np.sqrt(excess[best, axis] / count[best])),
@@ -175,7 +175,7 @@ def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float
 
 def _powers(rest, size, inside):
     """Return (power, power around it by octaves, both shape (n, 3), which frequencies have enough around them)."""
-    from scipy.signal import detrend  # here, because it takes long to import
+    from scipy.signal import detrend  # here, because its import is slow
 
     window = np.hanning(len(rest))
     power = np.abs(np.fft.rfft(detrend(rest, axis=0) * window[:, None], size, axis=0))**2 / (window**2).sum()

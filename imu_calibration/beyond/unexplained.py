@@ -1,4 +1,4 @@
-"""What remains when every effect has been asked about: how much, what it goes with, and where in the session it sits."""
+"""The residual after the test of every effect: its size, its correlation, and its regimes in the session."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from imu_calibration.selection.questions import Question
 SIGNIFICANT = 5.0
 """Standard deviations above noise from which a rest is significant."""
 LEAST_WINDOWS = 12
-"""With fewer windows the model itself hardly predicts those held out, and a rest says nothing."""
+"""Least number of windows; with fewer the model hardly predicts held-out windows."""
 WITHIN_SHARE = 0.02
 """Least excess of the variance within windows that counts."""
 ALPHA = 1e-4
@@ -28,23 +28,23 @@ class Unexplained:
     """Structure of one sensor's residual that no effect explains."""
 
     significant: bool
-    """Whether it stands out of noise and of the way in which every bias moves."""
+    """Whether it is significant against noise and plausible bias processes."""
     rms: float
-    """Rms beyond noise, m/s^2 or rad/s (but see `unit`): of the windows' means, or within windows where only that stands out."""
+    """Rms beyond noise, m/s^2 or rad/s (but see `unit`): of the windows' means, or within windows where only that is significant."""
     sigma: float
     """Standard deviations by which it exceeds noise."""
     correlates_with: str | None
-    """What it goes with most, or None."""
+    """Variable of the largest correlation, or None."""
     share: float
-    """Share of the windows' scatter that goes with it."""
+    """Share of the windows' variance explained by it."""
     where: str | None
     """Where in the session most of it sits."""
     residual: np.ndarray
     """Residual of the windows' means, shape (k, 3)."""
     noise_sd: np.ndarray
-    """What noise alone would leave there, shape (k, 3)."""
+    """Expected sd from noise, shape (k, 3)."""
     unit: str | None = None
-    """Unit of `rms` where it is not that of the sensor: 'rad/turn' where turns by hand leave most."""
+    """Unit of `rms` where it is not the sensor's: 'rad/turn' where turns by hand have the largest residual."""
     axes: tuple = ()
     """Axes of the sensor that carry it, the strongest first."""
     regimes: tuple = ()
@@ -64,10 +64,10 @@ def unexplained(attempt: Attempt, explained: Explained, chosen: Sequence[Questio
 
 def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dict[str, float]]:
     """
-    Return bias -> what it may be off by, one for each axis that carries a significant rest.
+    Return bias -> its possible error, for each axis with a significant residual.
 
-    What has another offset in half of the windows makes their means scatter by as much as it moves the bias: nobody knows which half is
-    right, and windows however many do not tell.
+    A different offset in half of the windows scatters their means by as much as it shifts the bias. Which half is
+    correct is unknown, for any number of windows.
     """
     found = []
     for sensor, rest in rests.items():
@@ -85,7 +85,7 @@ def _rest(attempt, explained, sensor, excess, values):
     white = floor.variance_beside_bias(recording.kind, recording.count, recording.duration, keys=recording.keys)
     noise_sd = np.sqrt(white + floor.bias_variance)
     sigma_means, sigma_within = explained.sigma(excess)
-    # Quiet axes hide what one alone has.
+    # Quiet axes dilute the excess of one.
     means, within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
     sigma = max(sigma_means, sigma_within) if within > WITHIN_SHARE * explained.n_within else sigma_means
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
@@ -103,7 +103,7 @@ def _rest(attempt, explained, sensor, excess, values):
 
 def correlate(explanations: Iterator, residual: np.ndarray) -> tuple[str | None, float]:
     """
-    Return (name, adjusted share of the variance) of what the residual goes with most, or (None, 0).
+    Return (name, adjusted share of the variance) of the variable with the largest correlation, or (None, 0).
 
     `explanations` are (name, columns (k, m), mask of the windows where they are known).
     """
