@@ -1,6 +1,6 @@
 """
-What the model gets wrong, and why: the story told about what `selection` found.
+Diagnosis of model errors and their causes: a description of the result of `selection`.
 
-In: windows and a sensor model. Out: a `Diagnosis`: findings in words, the extended model, the gain on held-out windows, what is
-unexplained. Read `diagnose` first.
+In: windows and a sensor model. Out: a `Diagnosis`: findings as sentences, the extended model, the gain on held-out windows, the
+unexplained residual. Read `diagnose` first.
 """

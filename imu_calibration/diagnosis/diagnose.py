@@ -1,4 +1,4 @@
-"""From windows to findings: the one function that asks every effect, and puts into words what was found."""
+"""From windows to findings: the function that tests every effect and describes the findings."""
 
 from dataclasses import replace
 from typing import Callable, Sequence
@@ -23,24 +23,24 @@ from imu_calibration.selection.gain import Gain, gain_in_turn, heldout_gain
 from imu_calibration.selection.investigation import Investigation
 
 MATE = 0.5
-"""What would do as well as a finding takes at least this share of what the finding takes off the residual of the sensor that shows it."""
+"""Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's reduction."""
 
 HALF = 0.5
-"""Share of a finding that an effect which is not named would take over, from which it is told beside the finding."""
+"""Share of a finding that an unnamed effect would replace, from which it is reported with the finding."""
 
 
 def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
              bias_processes: dict | None = None) -> Diagnosis:
     """
-    Say what a model gets wrong, and why.
+    Diagnose the errors of a model and their causes.
 
-    The recording is reduced once to sufficient statistics of every effect's columns per window; the search then asks each effect
+    The recording is reduced once to sufficient statistics of every effect's columns per window; the search then tests each effect
     that is not in the model on held-out windows.
 
     Parameters
     ----------
     windows : sequence of Window
-        One recording in order; windows of kind 'unused' are not fitted to, but let dead reckoning run through.
+        One recording in order; windows of kind 'unused' are not fitted, but are used by dead reckoning.
     table : Table
         The reference.
     model : SensorModel
@@ -48,7 +48,7 @@ def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, pro
     progress : callable, optional
         Called with the share that is done, in [0, 1].
     bias_processes : dict, optional
-        Sensor -> how its bias moves, where that was measured apart.
+        Sensor -> its bias processes, where measured separately.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
         The reference.
     found : Investigation
     calibrated : Solution, optional
-        Solution of a model with all findings, whose parameters are reported; default: the solution of the investigation.
+        Solution of a model with all findings, with the reported parameters; default: the solution of the investigation.
 
     """
     attempt, named, limits = found.attempt, found.named, found.limits
@@ -115,7 +115,7 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
 
 
 def _rivals(found, question):
-    """Return what would do nearly as well as a finding, and what nobody is sure of that would take over half of it."""
+    """Return alternatives to a finding that fit nearly as well, and doubtful effects that would replace half of it."""
     near = [rival.other for rival in found.rivals if rival.question.name == question.name]
     values = dict(zip(found.attempt.space.names, found.attempt.values(found.named)))
     own = [found.attempt.space.names[k] for k in question.parameters]

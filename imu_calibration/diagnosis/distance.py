@@ -107,7 +107,7 @@ class DistanceSums:
             self._rows[sensor].append(row)
 
     def distances(self) -> dict[str, Distance]:
-        """Return sensor -> Distance of the windows so far."""
+        """Return sensor -> Distance of the windows up to now."""
         edge = int(np.max(np.flatnonzero(self._freedom[0]), initial=0)) + 2
         return {sensor: self._distance(sensor, edge) for sensor in SENSORS}
 

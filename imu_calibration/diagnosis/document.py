@@ -11,7 +11,7 @@ FORMAT = 'imu_calibration/diagnosis/1'
 
 
 def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the content of diagnosis.json: plain dicts, lists, strings and numbers, None for what is not a number."""
+    """Return the content of diagnosis.json: plain dicts, lists, strings and numbers, None for NaN and infinity."""
     return _plain({
         'format': FORMAT,
         'baseline': {sensor: _baseline(diagnosis.baseline, sensor) for sensor in SENSORS},

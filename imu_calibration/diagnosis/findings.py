@@ -14,7 +14,7 @@ from imu_calibration.selection.search import Search
 def finding(search: Search, named: Sequence[Question], place: int, *, solution: Solution, share: Callable, gain_of: Callable,
             motion_of: Callable, shows: Callable = lambda place, mate, gain: True, rivals: Sequence[Question] = ()) -> Finding:
     """
-    Return the Finding of the effect at `place` among those named.
+    Return the Finding of the effect at `place` among the findings.
 
     Parameters
     ----------
@@ -23,13 +23,13 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
     named : list of Question
         In the order found.
     solution : Solution
-        Of the extended model; what it lacks is told as the search fitted it.
+        Of the extended model; effects that it lacks are reported with the values of the search.
     share : callable
         ``share(named, question)``: share of the unexplained that the effect removes.
     gain_of : callable
-        ``gain_of(place)``: the Gain of this effect on top of those before it.
+        ``gain_of(place)``: the Gain of this effect on top of the preceding ones.
     motion_of : callable
-        ``motion_of(question, mate)``: the motion that would tell two effects apart.
+        ``motion_of(question, mate)``: the motion that would separate two effects.
     shows : callable
         ``shows(place, mate, gain)``: whether an effect in the place of this one shows in the sensor that shows this one.
     rivals : sequence of Question
@@ -55,7 +55,7 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
 
 
 def _in_its_place(search, named, place, mate):
-    """Return parameter name -> (value, unit) of an effect that stands in the place of a finding."""
+    """Return parameter name -> (value, unit) of an effect that replaces a finding."""
     found = fitted(search, [*named[:place], mate, *named[place + 1:]], mate)
     return {name: (value, unit) for name, (value, _, unit) in found.items()}
 

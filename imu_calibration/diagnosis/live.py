@@ -1,4 +1,4 @@
-"""A diagnosis while the motion goes on: the question about a solution, and its outcome in the words of a status."""
+"""A diagnosis during the motion: its input, a solution, and its outcome as a status."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,33 +18,33 @@ from imu_calibration.selection.investigation import too_few_windows
 
 
 class Outcome(StrEnum):
-    """What a diagnosis came to."""
+    """Outcome of a diagnosis."""
 
     WAITING = 'waiting'
-    """It cannot be asked yet."""
+    """It is not possible yet."""
     OFF = 'off'
-    """It is not asked."""
+    """It is disabled."""
     FOUND = 'found'
     """The model lacks something that has a name."""
     NOTHING = 'nothing found'
     """The model is adequate."""
     UNEXPLAINED = 'unexplained'
-    """Something stays that no effect explains."""
+    """A residual is unexplained."""
     FAILED = 'failed'
     """It ended by a fault."""
 
 
 MATES, SIZE = 'mates of ', 'size of '
-"""What stands before the name of each finding, and before EFFECT.PARAMETER with a bare number in SI: for programs."""
+"""Prefix of the name of each finding, and of EFFECT.PARAMETER with a number in SI: for programs."""
 WAITING, OFF, FOUND, NOTHING, UNEXPLAINED, FAILED = Outcome
 
 
 @dataclass(frozen=True)
 class DiagnosisState:
-    """What a diagnosis said, or why none was made yet."""
+    """Result of a diagnosis, or the reason why there is none."""
 
     word: Outcome = WAITING
-    """What it came to."""
+    """Outcome."""
     message: str = f'it follows a solution of at least {LEAST_WINDOWS} windows'
     """One line."""
     values: dict = field(default_factory=dict)
@@ -53,27 +53,27 @@ class DiagnosisState:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a diagnosis came to, and what follows for the calibration."""
+    """Outcome of a diagnosis, and its consequence for the calibration."""
 
     state: DiagnosisState
-    """For people."""
+    """For display."""
     demand: Demand | None = None
-    """What the windows demand of the model; None where they could not be asked."""
+    """Effects that the windows support; None where they could not be tested."""
 
 
 @dataclass(frozen=True, eq=False)
 class DiagnosisQuestion:
-    """What a diagnosis needs, for another thread."""
+    """Input of a diagnosis, for another thread."""
 
     snapshot: LiveSnapshot
-    """What a solution was made of."""
+    """Data of a solution."""
 
     def is_the_same_as(self, other: 'DiagnosisQuestion') -> bool:
         """Return whether another question is about the same samples."""
         return self.snapshot.gathered.accumulator.samples == other.snapshot.gathered.accumulator.samples
 
     def answer(self, progress: Callable[[float], object] | None = None) -> Answer:
-        """Diagnose and return the Answer; `progress` is called with the share done and may raise to end it."""
+        """Diagnose and return the `Answer`; `progress` is called with the share done and may raise to end it."""
         try:
             evidence = self.snapshot.evidence(progress)
             if evidence.found is None:
@@ -90,7 +90,7 @@ def question_about(live: TableSession | None) -> DiagnosisQuestion | None:
 
 
 def describe(diagnosis: Diagnosis) -> DiagnosisState:
-    """Return the DiagnosisState of a Diagnosis: the first finding, or nothing, or what stays unexplained."""
+    """Return the DiagnosisState of a Diagnosis: the first finding, or none, or the unexplained residual."""
     values: dict[str, Any] = {'windows': diagnosis.windows, 'windows held out for the gain': diagnosis.locked}
     rest = [line for line in diagnosis_lines(diagnosis) if line.startswith('unexplained')]
     values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor, found.unit)

@@ -67,7 +67,7 @@ class Candidate:
     p_value_beside: float | None
     """Its p-value there."""
     verdict: str
-    """'found', 'as good as NAME', 'not needed beside the findings', 'no evidence', or the reason of a refusal."""
+    """``found``, ``as good as NAME``, ``not needed beside the findings``, ``no evidence``, or the reason of a refusal."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,12 @@ from imu_calibration.units import for_people, with_sd
 LEAVES_MOST = 'rejected: most of the residual would remain'
 """Verdict on an effect that is significant, but removes too small a share."""
 DISAGREED = 'refused: the windows do not agree on it'
-"""Verdict on an effect whose evidence is that of few windows, or of some against others."""
+"""Verdict on an effect with evidence from few windows only, or with contradictory windows."""
 
 
 def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], gain: Gain | None, *, n_clipped: int | None = None) -> str:
     """
-    Return what was found in one or two sentences, with its size in units that people use.
+    Return a finding in one or two sentences, with its size in common units.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], ga
     """
     values = [(name.split('.')[-1], *entry) for name, entry in parameters.items()]
     amplitudes = effect.amplitudes(values)
-    # What this recording cannot tell from another, such as the bias, is no size.
+    # A parameter that is collinear with another, such as the bias, is not a size.
     known = [entry for entry in amplitudes if abs(entry[1]) > 2 * entry[2]]
     label, value, sd, unit = max(known or amplitudes, key=lambda v: abs(v[1]))
     factor, unit = for_people(unit, effect.sensor)
@@ -60,9 +60,9 @@ def _with_unit(number, unit):
 def candidates_of(search: Search, named: Sequence[Question], *, agree: Callable[[Sequence[Question], Question], bool] | None = None,
                   ) -> tuple[Candidate, ...]:
     """
-    Return every effect that a search asked about beside the findings, the strongest first; of a warm-up its best time constant.
+    Return every effect that a search tested in addition to the findings, the strongest first; of a warm-up its best time constant.
 
-    `agree(chosen, question)` says whether the windows agree on one of the chosen effects.
+    `agree(chosen, question)` is whether the windows agree on one of the chosen effects.
     """
     found, mates, rows = {question.name for question in named}, {}, {}
     for question in named:

@@ -1,4 +1,4 @@
-"""Which motion would tell two effects apart: the standard motions are tried, for the effects as large as they were found."""
+"""The motion that would separate two effects: the best of the standard motions, for the estimated sizes of the effects."""
 
 from typing import Any
 
@@ -19,8 +19,8 @@ def separating_motion(solution: Solution, question: Question, mate: Question, *,
     """
     Return the standard motion after which the mate could no longer pass for the effect that was found.
 
-    For each motion: what it adds to the information about the extended model and the mate, and from that the part of the effect
-    that the mate, and everything else in the model, cannot imitate, in squared standard deviations.
+    For each motion: its added information about the extended model and the mate, and from that the part of the effect
+    that is not collinear with the mate and the model, in squared standard deviations.
 
     Parameters
     ----------
@@ -67,5 +67,5 @@ def _best_motion(solution, question, mate, gravity):
 
 
 def _unimitated(information, values, own):
-    """Return the squared standard deviations of the effect that nothing else in the model imitates, its mate included."""
+    """Return the squared standard deviations of the effect's part that is not collinear with the model, its mate included."""
     return float(values[own] @ np.linalg.solve(inverse_normal(information)[own, own], values[own]))

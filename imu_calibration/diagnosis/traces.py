@@ -46,7 +46,7 @@ class Traces:
     time: np.ndarray
     """Middle of each block, s, shape (n,)."""
     kind: np.ndarray
-    """Kind of the window it comes from, shape (n,)."""
+    """Kind of its window, shape (n,)."""
     position: np.ndarray
     """Joint angles, rad, shape (n, n_joints)."""
     force_s: np.ndarray
@@ -79,7 +79,7 @@ def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *
     Parameters
     ----------
     windows : sequence of Window
-        Those of kind 'unused' count for dead reckoning and segments only.
+        Windows of kind 'unused' are used for dead reckoning and segments only.
     table : Table
     before : Solution
         Baseline, with the noise of both sensors.

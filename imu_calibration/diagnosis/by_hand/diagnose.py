@@ -1,4 +1,4 @@
-"""What the model of a calibration by hand gets wrong: the same search, on poses and turns instead of windows on a table."""
+"""Diagnosis of a calibration by hand: the same search, on poses and turns instead of windows on a table."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ class HandDiagnosis:
     """A diagnosis of a recording without a table."""
 
     diagnosis: Diagnosis
-    """What was found."""
+    """Findings."""
     hand: HandCalibration
-    """The extended calibration; the baseline's when nothing was found."""
+    """The extended calibration; the baseline's without findings."""
 
 
 def diagnose_by_hand(data: HandData, options: HandOptions = HandOptions(), progress: Callable | None = None) -> HandDiagnosis:
     """
-    Say what a calibration by hand gets wrong, and why; arguments and errors as in `investigate_by_hand`.
+    Diagnose the errors of a calibration by hand and their causes; arguments and errors as in `investigate_by_hand`.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def diagnose_by_hand(data: HandData, options: HandOptions = HandOptions(), progr
 
 
 def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
-    """Return what an investigation found as a Diagnosis; `hand` is a calibration with everything that was found."""
+    """Return the result of an investigation as a Diagnosis; `hand` is a calibration with all findings."""
     inquiry, named = found.inquiry, list(found.named)
     before, after = as_solution(found.baseline), as_solution(hand)
 

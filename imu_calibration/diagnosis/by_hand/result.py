@@ -1,4 +1,4 @@
-"""What a diagnosis by hand hands back besides its findings: solutions, residuals of the poses, and what stays unexplained."""
+"""Results of a diagnosis by hand besides its findings: solutions, residuals of the poses, unexplained residual."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,11 +16,11 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.questions import Question
 
 PER_TURN = 'rad/turn'
-"""Unit of what turns leave: the angle by which gravity misses its direction after one."""
+"""Unit of the residual of turns: the angle between predicted and measured gravity after a turn."""
 
 
 def as_solution(hand: HandCalibration) -> Solution:
-    """Return a HandCalibration as the `Solution` that documents and reports know."""
+    """Return a HandCalibration as the `Solution` of documents and reports."""
     model = hand.model.model
     order = [hand.param_names.index(name) for name in model.param_names]
     held = np.array([hand.statuses[k] == 'held' for k in order])
@@ -38,7 +38,7 @@ def as_solution(hand: HandCalibration) -> Solution:
 
 
 def _rates_left(hand):
-    """Return the rates at rest that the model leaves, shape (k, 3)."""
+    """Return the residual rates at rest, shape (k, 3)."""
     poses, true = hand.poses, hand.gravity * hand.state.up
     more = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time,
                               temperature_c=poses.temperature_c)[0]
@@ -56,7 +56,7 @@ def traces_of(baseline: HandCalibration, hand: HandCalibration) -> Traces:
 
 
 def rest_of(hand: HandCalibration, inquiry: Any, named: Sequence[Question], *, sensor: str) -> Unexplained:
-    """Return what stays unexplained of one sensor: its rows at rest and its turns against what noise leaves."""
+    """Return the unexplained residual of one sensor: its rows at rest and its turns against the expectation from noise."""
     used = list(inquiry.search.used(named))
     residuals, sigma, rms, chosen = inquiry.evidence.residuals(used), -np.inf, 0.0, None
     for block, residual in zip(inquiry.blocks, residuals):
@@ -67,7 +67,7 @@ def rest_of(hand: HandCalibration, inquiry: Any, named: Sequence[Question], *, s
             continue
         own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
         if block.name == 'poses' or own > max(sigma, SIGNIFICANT):
-            size = 1.0 if block.duration is None else block.duration[:, None]**2   # a turn leaves an angle, a pose a rate
+            size = 1.0 if block.duration is None else block.duration[:, None]**2   # the residual of a turn is an angle, of a pose a rate
             excess = np.sum(residual**2 * size) / spare - np.mean(block.floor * size)
             if own > sigma:
                 sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block

@@ -9,19 +9,19 @@ from imu_calibration.by_hand.effect_rows import Block
 from imu_calibration.effects.base import AXES
 
 BY_CHANCE = 0.01
-"""Chance of a place by noise, all ranges of all variables tried."""
+"""Significance level of a regime, for all ranges of all variables."""
 MOST_OF_IT = 0.8
-"""Share of an axis' rest that an offset there takes away at least."""
+"""Least share of an axis' residual that an offset there explains."""
 NORM = 'norm'
-"""Without a table gravity says of the accelerometer's error along it only."""
+"""Without a table only the component of the accelerometer's error along gravity is observable."""
 
 
 def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -> tuple[RestRegime, ...]:
     """
     Return the clearest regime of each axis.
 
-    Poses are too few to be found on some and tested on others: the likeliest range is paid for by the number of ranges that there are. What
-    merely scatters more somewhere is not told, as every other range of few poses does.
+    Poses are too few for separate selection and test: the p-value of the likeliest range is multiplied by the number of ranges. Regimes
+    of larger scatter are not reported, since every other range of few poses has it.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -
     block : Block
         The sensor's rows in poses.
     residual : ndarray, shape (k, n_axes)
-        What the findings leave in each pose, by a fit that did not see it.
+        Residual of each pose, by a fit without it.
 
     """
     variables = _variables(hand, block)
@@ -47,7 +47,7 @@ def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -
 
 
 def _of_variable(block, axis, rows, sd, variable):
-    """Return the range of a variable in which an offset takes away most, or None where it has too few values."""
+    """Return the range of a variable in which an offset explains most, or None where it has too few values."""
     prior, marks = (np.zeros(1), np.zeros(1)), variable.marks / sd[:, None]
     best = next((chosen for chosen, offset in cleanest(rows, marks, prior, bins=variable.bins, cyclic=variable.cyclic) if offset), None)
     if best is None:
@@ -60,7 +60,7 @@ def _of_variable(block, axis, rows, sd, variable):
 
 
 def _variables(hand: HandCalibration, block: Block) -> list[Variable]:
-    """Return what a regime of poses may go by: the attitude, that of the pose before, the time and the temperature."""
+    """Return the variables of regimes of poses: the attitude, the previous attitude, the time and the temperature."""
     force = hand.gravity * hand.state.up
     before = np.concatenate([force[:1], force[:-1]])
     found = ranged('time', block.time, 's')
