@@ -39,7 +39,6 @@ def generate_launch_description():
         DeclareLaunchArgument('imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'),
         DeclareLaunchArgument('joint_states', default_value='joint_states', description='topic of sensor_msgs/JointState'),
         DeclareLaunchArgument('temperature', default_value='imu/temperature', description='topic of sensor_msgs/Temperature'),
-        DeclareLaunchArgument('foxglove', default_value='false', description='show it live to Foxglove over a websocket'),
         DeclareLaunchArgument('use_sim_time', default_value='false', description='use the time of /clock'),
         Node(
             package='imu_calibration', executable='calibration_node', namespace=LaunchConfiguration('namespace'), output='screen',
@@ -49,7 +48,6 @@ def generate_launch_description():
                 'imu_link': ParameterValue(LaunchConfiguration('imu_link'), value_type=str),
                 'save_file': ParameterValue(LaunchConfiguration('save_file'), value_type=str),
                 'resume': ParameterValue(LaunchConfiguration('resume'), value_type=bool),
-                'foxglove': ParameterValue(LaunchConfiguration('foxglove'), value_type=bool),
                 'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}],
             remappings=[('imu/data_raw', LaunchConfiguration('imu')), ('joint_states', LaunchConfiguration('joint_states')),
                         ('imu/temperature', LaunchConfiguration('temperature'))],

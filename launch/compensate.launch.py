@@ -37,14 +37,12 @@ def generate_launch_description():
         DeclareLaunchArgument('ekf', default_value='false', description="start robot_localization's ekf_node on the corrected messages"),
         DeclareLaunchArgument('ekf_params', default_value=PathJoinSubstitution([CONFIG, 'robot_localization_ekf.yaml']),
                               description='its parameters, YAML'),
-        DeclareLaunchArgument('foxglove', default_value='false', description='show it live to Foxglove over a websocket'),
         DeclareLaunchArgument('use_sim_time', default_value='false', description='use the time of /clock'),
         Node(
             package='imu_calibration', executable='compensator_node', namespace=LaunchConfiguration('namespace'), output='screen',
             parameters=[LaunchConfiguration('params'), {
                 'calibration_file': ParameterValue(LaunchConfiguration('calibration'), value_type=str),
                 'adopt': LaunchConfiguration('adopt'),
-                'foxglove': ParameterValue(LaunchConfiguration('foxglove'), value_type=bool),
                 'target_frame': ParameterValue(LaunchConfiguration('target_frame'), value_type=str), **use_sim_time}],
             remappings=[('imu/data_raw', LaunchConfiguration('imu')), ('imu/data_corrected', LaunchConfiguration('corrected'))],
         ),

@@ -1,8 +1,5 @@
 """Detection of stops in a stream of corrected samples, in blocks of a quarter of a second, and correction of the bias by them."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 
 from imu_calibration.compensation.health import CalibrationHealth
@@ -11,18 +8,6 @@ from imu_calibration.compensation.stops import BLOCK, StopDetector
 SIX = tuple[float, ...]
 AS_STOPS = [0, 4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
 """Columns of a sample for the detection of stops: time, force, rate, measured force, measured rate."""
-
-
-@dataclass(frozen=True, eq=False)
-class CorrectedStretch:
-    """The samples between two evaluations."""
-
-    first_ns: int
-    """Where the times of the samples begin, ns."""
-    samples: np.ndarray
-    """Time in ns, corrected and measured (rate x, y, z, force x, y, z), the corrected ones before any update of the bias, shape (n, 13)."""
-    offset: tuple[float, float, float]
-    """Correction subtracted from the corrected rate, rad/s."""
 
 
 class StopWatch:
@@ -37,8 +22,6 @@ class StopWatch:
 
     def __init__(self, health: CalibrationHealth):
         self.health, self._detector = health, StopDetector(health.noise_sd)
-        self.listener: Callable[[CorrectedStretch], None] | None = None
-        """Called with each CorrectedStretch, in the midst of the stream: it must be quick and must not fail."""
         self._waiting: list[SIX] = []
         self._first_ns = self._look = 0
         self._offset: tuple[float, float, float] | None = None
@@ -66,8 +49,6 @@ class StopWatch:
             self._first_ns, self._look, self._waiting, self._detector = stamp_ns, 0, [], StopDetector(self.health.noise_sd)
             return
         samples = np.array(self._waiting)
-        if self.listener is not None:
-            self.listener(CorrectedStretch(self._first_ns, samples, self._offset or (0.0, 0.0, 0.0)))
         since = int(samples[-1, 0])
         self._waiting, self._look = [], since + round(1e9 * BLOCK)
         rows = samples[:, AS_STOPS]

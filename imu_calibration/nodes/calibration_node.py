@@ -27,7 +27,6 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.nodes.calibration_guide import CalibrationGuide
 from imu_calibration.nodes.calibration_status import statuses_of
-from imu_calibration.nodes.calibration_view import CalibrationView
 from imu_calibration.nodes.calibration_worker import CalibrationWorker
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import markers_of
@@ -36,7 +35,6 @@ from imu_calibration.nodes.heap import give_arrays_own_pages
 from imu_calibration.nodes.hints import HINTS
 from imu_calibration.nodes.inputs import BatchInput, watch_inputs
 from imu_calibration.nodes.lifecycle import run_node
-from imu_calibration.nodes.live_view import FoxgloveSettings
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of, words_of
@@ -117,7 +115,6 @@ class CalibrationNode(Node):
         self._live_settings = declare_parameters(self, LiveSettings, self._change_live)
         self._options = self._read_options(declare_parameters(self, WindowSettings, self._change_windows))
         self._hand_settings = declare_parameters(self, LiveByHandSettings, self._change_by_hand)
-        view = declare_parameters(self, FoxgloveSettings, lambda group: self._view.change(group))
         robot = declare_parameters(self, RobotSettings)
         joints = [] if not robot.urdf_file and self.settings.table_file in NO_TABLE else ['joint_states']
         announce(self, ['imu/data_raw', *joints, 'imu/temperature'], ['imu/calibration', 'imu/residual', 'imu/coverage'])
@@ -129,8 +126,7 @@ class CalibrationNode(Node):
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
         self._coverage = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos())
-        self._view = CalibrationView(self, view)
-        listeners = Listeners(self._publish_document, self._publish_residuals, self._publish_coverage, self._view.take_solution)
+        listeners = Listeners(self._publish_document, self._publish_residuals, self._publish_coverage)
         self.worker = CalibrationWorker(self._gatherer, live, self._make_live, place=place, autosave_period=self.settings.autosave_period,
                                         listeners=listeners, hints=HINTS['calibration_node'], provenance=self._provenance(robot))
         for what in ('solve', 'diagnose', 'save', 'reset'):
@@ -154,7 +150,6 @@ class CalibrationNode(Node):
 
     def close(self) -> str:
         """End the worker after its present step; return the outcome for unsaved motion."""
-        self._view.close()
         return self.worker.end()
 
     def _read_options(self, windows: WindowSettings) -> CalibrationOptions:
@@ -225,7 +220,6 @@ class CalibrationNode(Node):
 
     def _publish_coverage(self, coverage: Any) -> None:
         self._publish(self._coverage, markers_of(coverage, self.get_clock().now().to_msg()))
-        self._view.take_coverage(coverage)
 
     def _publish(self, publisher: Any, message: Any) -> None:
         try:

@@ -208,7 +208,6 @@ class CalibrationWorker(threading.Thread):
         self._note_fault('solution', '')
         text = calibration_to_text(result.calibration)
         self.listeners.calibration(text)
-        self.listeners.solution(result, [window for spread in result.gathered.spreads for window in spread.windows])
         self._pacer.note(start, time.monotonic())
         return result, text
 

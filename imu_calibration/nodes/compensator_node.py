@@ -25,7 +25,6 @@ from imu_calibration.nodes import relay_loop
 from imu_calibration.nodes.adoption import Adopted, Awaited, adopt, again, has_moved
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
-from imu_calibration.nodes.compensator_view import CompensatorFoxglove, CompensatorView
 from imu_calibration.nodes.complaints import ERROR, Complaints
 from imu_calibration.nodes.guarded import guarded
 from imu_calibration.nodes.hints import HINTS
@@ -55,8 +54,6 @@ class CompensatorNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__('compensator_node', **options)
         self.settings = declare_parameters(self, CompensatorSettings, self._change_compensation, hints=HINTS['compensator_node'])
-        view = declare_parameters(self, CompensatorFoxglove, lambda group: self._view.change(group))
-        self._view = CompensatorView(self, view)
         self.adopted: Adopted | None = None
         self._previous: Adopted | None = None
         self._harmful = ''
@@ -116,7 +113,6 @@ class CompensatorNode(Node):
 
     def close(self) -> str:
         """Close the view."""
-        self._view.close()
         return ''
 
     def convert(self, data: bytes, information: dict) -> bytes | None:
@@ -192,7 +188,6 @@ class CompensatorNode(Node):
         if self.adopted is not None and self.adopted.version != adopted.version:
             self._previous = self.adopted
         self.adopted, self.problem, self._wanted = adopted, '', adopted.compensation
-        self._view.take_calibration(adopted)
         self.awaited = ''
         if self.temperature is None and (adopted.compensation.needs_temperature
                                          or adopted.calibration.conditions.get('temperature_range_c')):

@@ -92,15 +92,6 @@ class LiveCompensation(SampleCompensation):
         orientation = None if self.transfer is None else self._orientation(data)
         return message.rewritten(data, stamp_ns, corrected, rate_cov=rate_cov, force_cov=force_cov, orientation=orientation)
 
-    @property
-    def sd(self) -> tuple[np.ndarray, np.ndarray]:
-        """Standard deviations of corrected (rate, force) as they were published last, each shape (3,); NaN where there are none."""
-        return self._sd_in(self._rate_cov), self._sd_in(self._force_cov)
-
-    def _sd_in(self, packed):
-        variance = np.diag(self._message.unpacked(packed)) if packed else np.full(3, np.nan)
-        return np.sqrt(np.where(variance < 0, np.nan, variance))
-
     def _open(self, data):
         """Return whether a message with a new head can be corrected."""
         try:

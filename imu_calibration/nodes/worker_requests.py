@@ -5,9 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.segmentation.window import Window
-
 
 @dataclass(frozen=True)
 class Listeners:
@@ -19,8 +16,6 @@ class Listeners:
     """Called with ImuSamples."""
     coverage: Callable[[Any], None] = lambda coverage: None
     """Called with each new Coverage."""
-    solution: Callable[[CalibrationResult, list[Window]], None] = lambda result, windows: None
-    """Called with each new solution and the windows that are still there with their samples; none by hand."""
 
 
 class Request:

@@ -18,7 +18,6 @@ from imu_calibration.report.parameters import parameter_groups
 from imu_calibration.report.proof_section import proof_section
 from imu_calibration.report.readings import reading_tables
 from imu_calibration.report.residuals import residual_section
-from imu_calibration.report.worked_sample import worked_sample
 
 
 def calibration_report(result: CalibrationResult) -> str:
@@ -38,7 +37,7 @@ def calibration_report(result: CalibrationResult) -> str:
     return render('calibration.html', title='IMU calibration', verdict=result.verdict, usage=usage(result.calibration),
                   facts=recording_facts(result), proof=proof_section(result.calibration), tiles=tiles(result, errors, navigation),
                   groups=parameter_groups(result),
-                  sample=worked_sample(result), derived=derived_section(result), residuals=residual_section(result, errors),
+                  derived=derived_section(result), residuals=residual_section(result, errors),
                   observability=observability_section(result), levers=lever_section(result), navigation=navigation, at_rest=at_rest,
                   moving=moving, budget=budget_section(result), origin=origin_section(result), observations=result.observations)
 

@@ -1,4 +1,4 @@
-"""MCAP for Foxglove: a schema for every topic, the sphere as a SceneUpdate; only this module and foxglove_server use foxglove-sdk."""
+"""MCAP for Foxglove: a schema for every topic, the sphere as a SceneUpdate; the only user of foxglove-sdk."""
 
 from collections.abc import Mapping
 from io import BytesIO

@@ -1,27 +1,22 @@
-"""View of a calibration and of a compensation without the sphere, as JSON with a schema for each topic: in a file, and live."""
+"""Content of a view of a calibration except the sphere, as JSON with a schema for each topic."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 
-if TYPE_CHECKING:   # a compensator without a view must not wait for the imports of a calibration
+if TYPE_CHECKING:
     from imu_calibration.calibration.document import Calibration
     from imu_calibration.calibration.result import CalibrationResult
-    from imu_calibration.compensation.health import HealthState
-    from imu_calibration.compensation.stop_watch import CorrectedStretch
     from imu_calibration.segmentation.window import Window
 
 PARAMETERS, RESIDUAL, SPECTRUM, SPHERE = '/imu/parameters', '/imu/residual/windows', '/imu/residual/spectrum', '/imu/coverage'
-READINGS, HEALTH = '/imu/readings', '/imu/health'
 BAND = 1.959964
 """Standard deviations on each side of a value that hold 95 %."""
-SHOWN_RATE = 50.0
-"""Readings that are shown per second; more than a screen has points."""
 NUMBER, TEXT = {'type': 'number'}, {'type': 'string'}
 
 
@@ -41,9 +36,6 @@ SCHEMAS = {
     RESIDUAL: {'title': 'imu_calibration.Residual', **_object(windows=_list(
         time=NUMBER, motion=TEXT, before=SENSOR_AXES, after=SENSOR_AXES, floor=SENSOR_AXES))},
     SPECTRUM: {'title': 'imu_calibration.Spectrum', **_object(lines=_list(frequency=NUMBER, accelerometer=AXES, gyroscope=AXES))},
-    READINGS: {'title': 'imu_calibration.Readings', **_object(
-        measured=SENSOR_AXES, corrected=SENSOR_AXES, low=SENSOR_AXES, high=SENSOR_AXES)},
-    HEALTH: {'title': 'imu_calibration.Health', **_object(outcome=TEXT, message=TEXT, values=_list(name=TEXT, value=TEXT))},
 }
 """Topic -> JSON schema; SI units, times in s since the first sample."""
 
@@ -73,33 +65,6 @@ def spectrum(result: CalibrationResult, windows: Sequence[Window]) -> dict[str, 
     from imu_calibration.calibration.residual_spectrum import residual_spectrum
     frequency, density = residual_spectrum(result, windows)
     return {'lines': [{'frequency': float(f), **_by_sensor(density, k)} for k, f in enumerate(frequency)]}
-
-
-def readings(stretch: CorrectedStretch, sd: tuple[np.ndarray, np.ndarray]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """
-    Yield (stamp in ns, measured and corrected readings with their band) of some samples of a stretch.
-
-    Parameters
-    ----------
-    stretch : CorrectedStretch
-    sd : pair of ndarray
-        Standard deviations of corrected (rate, force), each shape (3,).
-
-    """
-    since, corrected, measured = stretch.samples[:, 0], stretch.samples[:, 1:7].copy(), stretch.samples[:, 7:]
-    corrected[:, :3] -= stretch.offset
-    half = BAND * np.concatenate(sd)
-    rate = (len(since) - 1) / max(1e-9 * (since[-1] - since[0]), 1e-9)
-    for k in range(0, len(since), max(round(rate / SHOWN_RATE), 1)):
-        rows = {'measured': measured[k], 'corrected': corrected[k], 'low': corrected[k] - half, 'high': corrected[k] + half}
-        yield stretch.first_ns + int(since[k]), {
-            name: {'gyroscope': _axes(row[:3]), 'accelerometer': _axes(row[3:])} for name, row in rows.items()}
-
-
-def health(state: HealthState) -> dict[str, Any]:
-    """Return the result of the last stop."""
-    return {'outcome': str(state.word), 'message': state.message,
-            'values': [{'name': name, 'value': str(value)} for name, value in state.values.items()]}
 
 
 def _by_sensor(vectors, k):

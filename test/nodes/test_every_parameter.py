@@ -19,7 +19,7 @@ SAMPLE = ROOT / 'bags' / 'sample_session'
 START = {'simulator_node': {'profile': 'none', 'table_file': TABLE}, 'bag_player_node': {'bag': SAMPLE, 'wait_for_subscribers': 100},
          'planner_node': {'table_file': TABLE}, 'calibration_node': {'table_file': TABLE}, 'compensator_node': {}}
 SERVICES = {GetParameters: 'get_parameters', SetParameters: 'set_parameters', SetParametersAtomically: 'set_parameters_atomically'}
-NAMED = {'adopt': 'topic', 'foxglove': False, 'calibration_file': str(SAMPLE / 'truth.yaml'), 'target_frame': 'base_link',
+NAMED = {'adopt': 'topic', 'calibration_file': str(SAMPLE / 'truth.yaml'), 'target_frame': 'base_link',
          'noise_file': ''}
 """Values of live parameters that not every value fits."""
 

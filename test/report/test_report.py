@@ -20,7 +20,6 @@ from imu_calibration.report.navigation_section import expected_growth, motion_gr
 from imu_calibration.report.numbers import fixed, text
 from imu_calibration.report.readings import reading_tables
 from imu_calibration.report.residuals import autocorrelation
-from imu_calibration.report.worked_sample import worked_sample
 from imu_calibration.samples import SampleBlock
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
@@ -137,19 +136,6 @@ def test_the_decision_comes_first_with_its_next_step(pages, name, word, next_ste
     head = pages[name][:pages[name].index('<nav>')]
     assert f'<section class="verdict {word}">' in head
     assert next_step.lower() in head.lower()
-
-
-def test_the_worked_sample_can_be_followed_with_the_printed_numbers(on_table):
-    section = worked_sample(on_table)
-    number = lambda texts: np.array([float(t.replace('−', '-')) for t in texts])
-    steps = {step['what']: number(step['values']) for step in section['steps']}
-    lever = {'raw specific force': steps['lever-arm terms u'], 'raw rate': 0.0}
-    for matrix, raw, corrected in zip(section['matrices'], lever, ('corrected specific force', 'corrected rate')):
-        by_reader = np.array([number(row) for row in matrix['inverse']]) @ (steps[raw] - number(matrix['bias']) - lever[raw])
-        assert by_reader == pytest.approx(steps[corrected], abs=3e-5)
-    noise = on_table.solution.noise
-    assert np.all(np.abs(steps['corrected specific force'] - steps['reference of the table: force']) < 5 * noise['accelerometer'].white_sd)
-    assert np.all(np.abs(steps['corrected rate'] - steps['reference of the table: rate']) < 5 * noise['gyroscope'].white_sd)
 
 
 def test_windows_after_calibration_scatter_as_noise_alone_would(on_table, by_hand):
