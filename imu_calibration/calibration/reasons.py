@@ -6,6 +6,7 @@ from enum import StrEnum
 
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.errors import with_hint
 
 
 class StatementKind(StrEnum):
@@ -46,6 +47,10 @@ class Reason:
     """The input needed for it, a key of `errors.KEYS`."""
     sensors: tuple[str, ...] = SENSORS
     """Sensors with parameters that it concerns."""
+
+    def advice(self, hints: dict[str, str] | None = None) -> str:
+        """Return the next step with the local name of its key (`errors.with_hint`); empty for none."""
+        return with_hint(self.next, self.key, hints or {}) if self.next else ''
 
 
 def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:

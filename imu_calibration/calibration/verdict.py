@@ -35,7 +35,6 @@ from imu_calibration.calibration.verdict_notes import notes_on
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.sensor_model import linear_names
-from imu_calibration.errors import with_hint
 
 SCALES = tuple(linear_names('accelerometer').diagonal().tolist())
 
@@ -80,7 +79,7 @@ def lines_of(reasons: Iterable[Reason], hints: dict[str, str] | None = None) -> 
     lines = []
     for reason in reasons:
         lines.append(f'{reason.word}: {reason.what}' if reason.word in (WARNING, NOTE) else reason.what)
-        lines += [f'next: {with_hint(reason.next, reason.key, hints or {})}'] if reason.next else []
+        lines += [f'next: {reason.advice(hints)}'] if reason.next else []
     return list(dict.fromkeys(lines))
 
 
