@@ -80,7 +80,7 @@ __version__ = '0.1.0'
 
 
 def __getattr__(name: str) -> object:
-    """Import the names of `__all__` when they are asked for (PEP 562): the package itself stays light and free of ROS."""
+    """Import the names of `__all__` at their first use (PEP 562): the package itself is quick to import and free of ROS."""
     if name not in __all__:
         raise AttributeError(f"module 'imu_calibration' has no attribute '{name}'")
     from imu_calibration.use_cases import notebook

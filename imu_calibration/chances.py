@@ -1,7 +1,7 @@
 """
 Probabilities of an equal or larger value by chance: upper tails of the distributions of significance tests.
 
-The same numbers as ``scipy.stats``, by special functions alone; the import of scipy.stats is slower than that of
+The same numbers as ``scipy.stats``, by special functions only; the import of scipy.stats is slower than that of
 all remaining modules together, and every command and node would wait for it.
 """
 

@@ -55,7 +55,7 @@ def to_text(document: dict[str, Any]) -> str:
 
 @cache
 def _with_floats(name: str) -> Any:
-    """Return PyYAML's reader or writer of that name, in C where available, with `FLOAT`: a text that looks like a number is then quoted."""
+    """Return PyYAML's reader or writer of that name, in C where available, with `FLOAT`: a text that resembles a number is then quoted."""
     import yaml
     kind: Any = type(name, (getattr(yaml, f'C{name}', getattr(yaml, name)),), {})
     kind.add_implicit_resolver('tag:yaml.org,2002:float', FLOAT, list('-+.0123456789'))
@@ -118,7 +118,7 @@ def _look_through(events, what, aliases):
         count += sizes[event.anchor] if kind == 'AliasEvent' else 1
         if kind == 'ScalarEvent':
             sizes[event.anchor] = 1
-            if event.implicit[0] or event.tag:   # else it is a quoted text
+            if event.implicit[0] or event.tag:   # false for a quoted text
                 _within_limits(len(event.value), LONGEST, what, 'characters in a row')
                 if NUMBER.fullmatch(event.value):
                     _within_limits(len(event.value), LONGEST_NUMBER, what, 'characters in a number')

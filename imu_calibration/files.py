@@ -1,4 +1,4 @@
-"""Files that the verbs read and write: whole or not at all."""
+"""Files that the verbs read and write, atomically."""
 
 import hashlib
 import io
@@ -117,7 +117,7 @@ def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False)
                          code='package_missing') from error
     try:
         return xacro.process_file(str(path)).toxml()
-    except Exception as error:   # macros raise whatever their expressions do
+    except Exception as error:   # expressions in macros may raise any exception
         reason = shortened(str(error), 200) or type(error).__name__
         raise InputError(f'the robot description {path} must be one that xacro can expand, it says: {reason}; correct it, or expand it '
                          'yourself to a .urdf', code='xacro_fails') from error
@@ -150,20 +150,20 @@ def make_folder(path: str | PathLike[str]) -> Path:
 
 @contextmanager
 def output_folder(path: str) -> Iterator[Path]:
-    """Give the output folder; when the work is refused, folders that were made for it are taken away again."""
+    """Yield the output folder; when the work is refused, folders made for it are removed."""
     missing = [folder for folder in (Path(path), *Path(path).parents) if not folder.exists()]
     folder = make_folder(path)
     try:
         yield folder
     except BaseException:
-        with suppress(OSError):   # a folder that holds something stays
+        with suppress(OSError):   # a folder with content is not removed
             for made in missing:
                 made.rmdir()
         raise
 
 
 def write_text(path: str | PathLike[str], text: str) -> None:
-    """Write a text file whole or not at all; raises as `write_whole`."""
+    """Write a text file atomically; raises as `write_whole`."""
     write_whole(path, text.encode(), to_disk=False)
 
 
@@ -180,19 +180,19 @@ def hash_of(path: str | PathLike[str]) -> str:
 
 def write_whole(path: str | PathLike[str], data: bytes, to_disk: bool = True) -> None:
     """
-    Write bytes beside the file and rename.
+    Write bytes to a temporary file in the same folder and rename it.
 
     Parameters
     ----------
     path : path-like
     data : bytes
     to_disk : bool
-        Wait until the disk has them, so that they outlast a power failure; a busy disk takes seconds.
+        Wait until the data are on the disk, so that they survive a power failure; seconds on a busy disk.
 
     Raises
     ------
     InputError
-        When the place cannot be written; what was there stays.
+        When the path cannot be written; an existing file is unchanged.
 
     """
     path = Path(path)
@@ -207,7 +207,7 @@ def write_whole(path: str | PathLike[str], data: bytes, to_disk: bool = True) ->
 
 def try_place(path: Path) -> None:
     """
-    Try whether `write_whole` could write a file now; nothing is left behind but its folder.
+    Check that `write_whole` could write a file now; only its folder remains.
 
     Raises
     ------
@@ -244,7 +244,7 @@ def put_aside(path: str | PathLike[str]) -> Path:
 
 
 def remove_leftovers(path: Path) -> None:
-    """Remove the temporary files of processes that were killed while they wrote a file; nothing happens where that is impossible."""
+    """Remove the temporary files of processes that were killed while they wrote a file; errors are ignored."""
     with suppress(OSError, ValueError):
         for found in path.parent.glob(f'.[0-9]*.{_ending(path)}'):
             number = found.name.split('.')[1]
@@ -268,8 +268,8 @@ def _ending(path: Path) -> str:
 
 @contextmanager
 def _beside(path):
-    """Give a name in the same folder that nobody can guess, for a file to be made; an error becomes one line, and that file is removed."""
-    # A link placed under a known name would be followed; a name as long as allowed leaves no room for an ending.
+    """Yield an unpredictable name in the same folder for a new file; an error becomes one line, and that file is removed."""
+    # A link placed under a predictable name would be followed; a suffix to a name of the longest length would exceed the limit.
     beside = path.parent / f'.{os.getpid()}.{token_hex(8)}.{_ending(path)}'
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -277,5 +277,5 @@ def _beside(path):
     except (OSError, ValueError) as error:
         raise InputError(f'{path} must be writable: {_why(error)}; choose another place', code='not_writable') from error
     finally:
-        with suppress(OSError, ValueError):   # where nothing can be written, nothing can be taken away either
+        with suppress(OSError, ValueError):   # in a read-only folder removal fails too
             beside.unlink(missing_ok=True)

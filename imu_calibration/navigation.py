@@ -159,7 +159,7 @@ def drift_over(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *,
     seconds : float
         Length of a stretch; stretches follow one another without overlap.
     earth_rate_n : array, shape (3,)
-        Must match what `reference.rate_s` contains.
+        Must match the content of `reference.rate_s`.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Files that are installed with the package, found beside the code that runs: checkout, colcon workspace or pip."""
+"""Files that are installed with the package, searched relative to the running code: checkout, colcon workspace or pip."""
 
 import os
 import sys
@@ -13,8 +13,8 @@ def share_folder() -> Path:
     """
     Return the folder that holds `config` and `launch`.
 
-    The checkout or installation that this module itself was loaded from comes first, so that a second
-    installation on the machine cannot answer for it; then the sourced workspaces; then the interpreter's prefix.
+    The checkout or installation of this module has priority, so that a second
+    installation on the machine cannot replace it; then the sourced workspaces; then the interpreter's prefix.
 
     Raises
     ------

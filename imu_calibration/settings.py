@@ -30,7 +30,7 @@ class Setting:
     session: bool
     """Whether it names an input of a session: settings files omit it, because they would override earlier options."""
     path: bool
-    """Whether it is the path of a file; such a ROS parameter is read-only, because any participant can set the others."""
+    """Whether it is the path of a file; such a ROS parameter is read-only, because any participant can set writable ones."""
 
 
 def setting(default: Any, unit: str, text: str, bounds: tuple = (None, None), symptom: str = '', *, live: bool = False,

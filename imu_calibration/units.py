@@ -1,4 +1,4 @@
-"""Units for people, and as many digits as a standard deviation supports: for what is printed, never for arithmetic."""
+"""Customary units, and as many digits as a standard deviation supports: for printed values, never for arithmetic."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ _SHOWN = {
             'rad/s^2/sqrt(Hz)': (60 * 3600 / DEG, 'deg/h/√h'), 'rad/s': (3600 / DEG, 'deg/h'), 'rad': (3600 / DEG, 'arcsec'),
             'rad/s/K': (3600 / DEG, '(deg/h)/K'), 'rad/s^2': (3600 * 3600 / DEG, '(deg/h)/h'), 's': (1.0, 's')},
 }
-"""Quantity ('' for all) or sensor -> SI unit -> (factor, unit that people use)."""
+"""Quantity ('' for all) or sensor -> SI unit -> (factor, customary unit)."""
 
 
 OTHER_UNITS = {'g': 1 / STANDARD_GRAVITY, 'mg': 1e3 / STANDARD_GRAVITY}
@@ -34,7 +34,7 @@ def unit_of_rest(length: float) -> str:
 
 def for_people(unit: str, quantity: str = '') -> tuple[float, str]:
     """
-    Return (factor, unit) that converts an SI value for people; (1, unit) where people read SI.
+    Return (factor, unit) that converts an SI value to its customary unit; (1, unit) where that is the SI unit.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """
-Correct an IMU's messages with a calibration, live, and feed robot_localization with them where that is asked for.
+Correct an IMU's messages with a calibration, live, and optionally feed robot_localization with them.
 
     ros2 launch imu_calibration compensate.launch.py calibration:=/path/to/calibration.yaml imu:=/imu/data_raw
     ros2 launch imu_calibration compensate.launch.py calibration:=/path/to/calibration.yaml corrected:=imu/data ekf:=true
 
-Whoever listens to imu/data, as most programs do, gets corrected readings by corrected:=imu/data and a driver on imu/data_raw.
+Subscribers of imu/data, the usual topic, receive corrected readings with corrected:=imu/data and a driver on imu/data_raw.
 """
 
 from launch.actions import DeclareLaunchArgument

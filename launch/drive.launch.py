@@ -1,5 +1,5 @@
 """
-Let a table or an arm move by itself until the IMU on it is calibrated; nothing moves before ~/start.
+Move a table or an arm automatically until the IMU on it is calibrated; there is no motion before ~/start.
 
     ros2 launch imu_calibration drive.launch.py table:=/path/to/table.yaml joint_trajectory:=/joint_trajectory_controller/joint_trajectory
 

@@ -19,7 +19,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 
 def run(options: Namespace) -> VerbResult:
-    """Print the errors before and after with their interval and the decision; exit code 0 where each sensor helps, else 3."""
+    """Print the errors before and after with their interval and the decision; exit code 0 when it helps each sensor, otherwise 3."""
     from imu_calibration.cli.show import console, show_table, warn
     from imu_calibration.preflight.checks import warnings
     from imu_calibration.use_cases.check import check

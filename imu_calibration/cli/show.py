@@ -24,7 +24,7 @@ def show_table(out: Any, headings: Sequence[str], rows: Iterable[Sequence[str]],
     """
     Print a table without lines, `numbers` flush right; where it is wider than the terminal, lines break between words only.
 
-    Rich would shrink the widest columns first, whatever their longest word. `dimmed`: rows with an empty last cell are dim.
+    Rich would shrink the widest columns first, even below their longest entry. `dimmed`: rows with an empty last cell are dim.
     """
     from rich.table import Table
     rows = [tuple(row) for row in rows]

@@ -1,4 +1,4 @@
-"""What `imu_calibration watch` shows of a session, made from its statuses on /diagnostics."""
+"""Screen of `imu_calibration watch`, made from the session's statuses on /diagnostics."""
 
 import math
 from dataclasses import dataclass, field
@@ -36,7 +36,7 @@ def ratio_of(status: NodeStatus) -> float:
 
 
 def bar(ratio: float, width: int = BAR) -> str:
-    """Return a bar that shrinks as a parameter becomes known; ``|`` stands where it is determined."""
+    """Return a bar that shrinks with the uncertainty of a parameter; ``|`` marks its tolerance."""
     tick = round(width * math.log(1 / LEAST) / math.log(MOST / LEAST))
     if math.isnan(ratio):
         return ' ' * tick + '|' + '?' * (width - tick - 1)
@@ -48,16 +48,16 @@ def bar(ratio: float, width: int = BAR) -> str:
 
 def screen(node: str, statuses: dict[str, NodeStatus], picture: str) -> Any:
     """
-    Return what is shown, for a console of rich.
+    Return the screen, for a console of rich.
 
     Parameters
     ----------
     node : str
-        Who is watched.
+        Name of the watched node.
     statuses : dict
         Name of the status, without the node's -> NodeStatus.
     picture : str
-        The line that stands beside the sphere of imu/coverage; '' without one.
+        The text line of the sphere of imu/coverage; '' without one.
 
     """
     from rich.console import Group

@@ -248,6 +248,6 @@ def test_live_messages_give_the_samples_of_a_bag(as_bytes):
     np.testing.assert_array_equal(block.imu.force_s, imu.force_s[10:])
     np.testing.assert_array_equal(block.joints.velocity, joints.velocity)
     np.testing.assert_array_equal(block.temperature.temperature_c, temperature.temperature_c)
-    assert block.dropped == {'Imu message that came faster than it was used': 10}
+    assert block.dropped == {'Imu message that was dropped because the queue was full': 10}
     empty = gatherer.flush()
     assert empty.imu is None and empty.joints is None and empty.dropped is None
