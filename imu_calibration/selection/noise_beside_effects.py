@@ -34,8 +34,8 @@ Bias variation that is normal for any white noise, m/s^2 and rad/s: the best acc
 """
 WIDEST = 100.0
 """
-Largest drift over the usual bias variation, by which the priors of the effects, for consumer instruments, exceed theirs.
-beyond theirs.
+Largest drift over the usual bias variation: the ratio by which the effects' priors, for consumer instruments, exceed their bias
+variation.
 """
 LEAST_FACTOR = 0.9
 """Moving windows scatter no less than this share of the noise at rest."""
