@@ -1,8 +1,7 @@
 """
-Which attitude to hold next, by hand: the one planner behind plan, terminal, status, picture and what a calibration asks for.
+Next attitude by hand: the planner for plan, terminal, status, picture and the motions that a calibration requests.
 
-The worth of a step is what it takes off what is missing (the logarithms of standard deviations over tolerances), its price the seconds that
-it takes.
+The gain of a step is the decrease of the excess (logarithms of standard deviations over tolerances), its cost the duration in seconds.
 """
 
 from __future__ import annotations
@@ -25,21 +24,21 @@ if TYPE_CHECKING:
     from imu_calibration.by_hand.calibrate import HandCalibration
 
 TREMBLING, CREEPING = 1.5e-3, 5e-4
-"""m/s^2, rad/s (0.03 deg/s); what noise and a hand that trembles and creeps leave in the means of such a pose, before that is known."""
+"""m/s^2, rad/s (0.03 deg/s); expected sd of the means of a pose from noise, trembling and creeping hands, before it is estimated."""
 MARGIN = 0.85
-"""Of the tolerance, aimed at: the scatter of some twenty poses and turns, which enters every standard deviation, is known to a sixth."""
+"""Share of the tolerance as goal: the scatter of some twenty poses and turns, a part of every standard deviation, is known to a sixth."""
 MOST_STEPS = 60
 LEAST_GAIN = 1e-3
-"""Poses that take less than this off what is missing do not end; something else must come, such as the gravity."""
+"""Poses with a smaller relative gain are not planned; other information is required, such as the gravity."""
 WEIGHTS = (0.0, 1.0)
-"""How much the seconds of a step count where it is chosen: `foretold` tries both."""
+"""Exponents of the seconds of a step in its choice: `foretold` tries both."""
 SERVES = 0.5
-"""Share of the best gain per second for one sensor from which the next step of the whole plan is said for it too."""
+"""Share of the best gain per second for one sensor from which the next step of the common plan is recommended for it too."""
 
 
 @dataclass(frozen=True, eq=False)
 class HandKnowledge:
-    """What is known by hand so far, and what one more pose is expected to be worth."""
+    """Current information of a session by hand, and the expected information of one more pose."""
 
     model: HandModel
     """The parameters."""
@@ -48,21 +47,21 @@ class HandKnowledge:
     information: np.ndarray
     """Of the data so far, shape (n, n)."""
     tolerances: np.ndarray
-    """What is aimed at, shape (n,)."""
+    """Goal, shape (n,)."""
     pose_sd: float
-    """What one pose is good for, m/s^2."""
+    """Expected sd of one pose, m/s^2."""
     drift_sd: float
     """The same for the bias of the gyroscope, rad/s."""
     turn_sd: float
     """The same for a turn, rad."""
     up: np.ndarray | None
-    """What is up now, shape (3,); None: nobody knows."""
+    """Current vertical in the sensor frame, shape (3,); None: unknown."""
 
     def after(self, ups: np.ndarray, turns: np.ndarray) -> np.ndarray:
-        """Return the information after going to each of some directions, by turns with these `turn_rows` (k, 2, 9), and a rest."""
+        """Return the information after a turn to each of several directions, with these `turn_rows` (k, 2, 9), and a rest."""
         bias, matrix, *_ = unpack(self.values)
         forces = bias + self.model.gravity * ups @ matrix.T
-        # temperature and time as at the reference point: one more pose there says nothing of thermal effects
+        # temperature and time at the reference point: one more pose there has no information about thermal effects
         count = len(ups)
         warmth = np.full(count, self.model.model.temperature_ref_c)
         norms = self.model.norm_rows(self.values, forces, time=np.zeros(count), temperature_c=warmth)[1]
@@ -70,7 +69,7 @@ class HandKnowledge:
         return self.information + np.einsum('kri,krj->kij', rows, rows)
 
     def rows(self, norms: np.ndarray, turns: np.ndarray) -> np.ndarray:
-        """Return what poses say of the parameters, in sd, shape (k, 6, n): lengths of gravity (k, n), rates at rest, turns (k, 2, 9)."""
+        """Return the design of poses in sd, shape (k, 6, n): from lengths of gravity (k, n), rates at rest, turns (k, 2, 9)."""
         rows = np.zeros((len(norms), 6, self.model.size))
         rows[:, 0] = norms / self.pose_sd
         rows[:, 1:4, GYRO_BIAS] = np.eye(3) / self.drift_sd
@@ -83,44 +82,44 @@ class HandKnowledge:
         return np.sqrt(np.diagonal(inverse, axis1=-2, axis2=-1))
 
     def missing(self, information: np.ndarray, only: Sequence[int] | slice = slice(None)) -> np.ndarray:
-        """Return the `excess` of all or some parameters that stays with some information; leading axes are kept."""
+        """Return the remaining `excess` of all or some parameters given some information; leading axes are kept."""
         return excess(self.sd(information)[..., only], self.tolerances[only])
 
     def best(self, only: Sequence[int] | slice = slice(None), *, weight: float = 1.0) -> tuple[HandStep, np.ndarray, np.ndarray]:
         """
-        Return (the step that gives most per second, share of what is missing that each of `DIRECTIONS` would give, information after it).
+        Return (the step with the largest gain per second, relative gain of each of `DIRECTIONS`, information after the step).
 
         only : sequence of int, optional
-            Parameters that it is for; all where not given.
+            Parameters for which the gain is computed; by default all.
         weight : float
-            Power with which seconds count; 0: not at all.
+            Exponent of the seconds; 0: they do not count.
 
         """
         steps, turns = steps_from(self.up)
         information = self.after(DIRECTIONS, turns)
         worth = share_gained(float(self.missing(self.information, only)), self.missing(information, only))
         if self.up is not None:
-            worth[DIRECTIONS @ self.up > np.cos(TURNED)] = 0.0   # it is there already
+            worth[DIRECTIONS @ self.up > np.cos(TURNED)] = 0.0   # the current attitude
         place = int(np.argmax(worth / np.array([step.seconds for step in steps])**weight))
         return steps[place], worth, information[place]
 
     def then(self, step: HandStep) -> HandKnowledge:
-        """Return what is known after a step."""
+        """Return the knowledge after a step."""
         return replace(self, information=self.after(step.up[None], turn_rows(self.up, step.up)[None])[0], up=step.up)
 
 
 def foretold(knowledge: HandKnowledge) -> list[HandStep]:
     """
-    Return the steps still needed: of the plans that count the seconds of each step and that do not, the one that is sooner at its end.
+    Return the steps still needed: the shorter of the plans with and without the seconds of each step in its choice.
 
-    What gives most in each second is not the sooner plan always: it begins with small turns, which leave more to be done.
+    The largest gain per second is not always the shortest plan: it begins with small turns, after which more remains to be done.
     """
     plans = [_rollout(knowledge, weight) for weight in WEIGHTS]
     return min(plans, key=lambda plan: (plan[1], sum(step.seconds for step in plan[0])))[0]
 
 
 def _rollout(knowledge, weight):
-    """Return (the steps, one best after the other, what is missing in the end)."""
+    """Return (the steps by greedy choice, the remaining excess)."""
     steps: list[HandStep] = []
     while float(knowledge.missing(knowledge.information)) > 0 and len(steps) < MOST_STEPS:
         step, worth, _ = knowledge.best(weight=weight)
@@ -135,7 +134,7 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     """
     Return {'parameters': {name: sd over tolerance}, 'needs': the step that helps most} for each sensor that is not fully determined.
 
-    That is the next step of the whole plan, which the picture shows, where it serves a sensor; else what serves it best.
+    Recommended is the next step of the common plan, shown in the picture, if it serves the sensor; otherwise the best step for the sensor.
     """
     knowledge, lacking = knowledge_after(hand), {}
     for name, status, sd, tolerance in zip(hand.param_names, hand.statuses, hand.sd, hand.tolerances, strict=True):
@@ -159,7 +158,7 @@ def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHan
                        noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
                        poses: Poses | None = None) -> HandKnowledge:
     """
-    Return the HandKnowledge before the first solution: only the poses count, at nominal values and with the scatter of the settings.
+    Return the HandKnowledge before the first solution: from the poses only, at nominal values and with the scatter of the settings.
 
     Parameters
     ----------
@@ -167,9 +166,9 @@ def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHan
     tolerances : ndarray, shape (n,)
     settings : ByHandSettings
     noise : tuple
-        What the sensors' own noise adds to a pose (m/s^2), to its mean rate (rad/s) and to a turn (rad).
+        Contribution of the sensor noise to a pose (m/s^2), to its mean rate (rad/s) and to a turn (rad).
     poses : Poses, optional
-        Those so far.
+        Poses so far.
 
     """
     scatter = (np.hypot(settings.pose_scatter, TREMBLING), np.hypot(settings.drift_scatter, CREEPING), settings.turn_scatter)
@@ -179,13 +178,13 @@ def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHan
     if poses is None:
         return knowledge
     ups = ups_of(poses)
-    turns = np.array([turn_rows(start, end) for start, end in zip([None, *ups[:-1]], ups, strict=True)])   # nothing leads to the first pose
+    turns = np.array([turn_rows(start, end) for start, end in zip([None, *ups[:-1]], ups, strict=True)])   # no turn before the first pose
     rows = knowledge.rows(model.norm_rows(model.nominal, poses.force)[1], turns)
     return replace(knowledge, information=np.einsum('kri,krj->ij', rows, rows), up=ups[-1])
 
 
 def knowledge_after(hand: HandCalibration) -> HandKnowledge:
-    """Return the HandKnowledge of a solution: its information, less what its standard deviations have grown by beyond noise."""
+    """Return the HandKnowledge of a solution: its information, reduced by the growth of its standard deviations beyond noise."""
     model, statistics, poses = hand.model, hand.statistics, hand.poses
     published = [hand.param_names.index(name) for name in model.param_names]
     expected = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))

@@ -1,4 +1,4 @@
-"""Biases that move within the recording: how far, seen in the poses beside everything that is estimated."""
+"""Drift of biases within the recording, estimated from the poses together with all parameters."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,9 +12,9 @@ from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.preflight.finding import WARNING, CheckFinding
 
 P_VALUE = 1e-3
-"""A course in time is believed when chance would show it less often."""
+"""A drift is significant below this p-value."""
 SPARE = 6
-"""Poses beyond the columns, at least."""
+"""Least number of poses beyond the columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class BiasMovement:
     course: np.ndarray
     """Departure from its mean in each pose, shape (k, 3), m/s^2 or rad/s."""
     growth: np.ndarray
-    """Factor by which the sds of the sensor's bias and matrix grow when the course is estimated beside them, shape (n,)."""
+    """Factor by which the sds of the sensor's bias and matrix grow when the drift is estimated too, shape (n,)."""
 
     @property
     def size(self) -> np.ndarray:
@@ -46,13 +46,13 @@ def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[s
 
 
 def _powers(time, count):
-    """Return time and its square as far as there are poses enough, without their means, shape (k, 1 or 2)."""
+    """Return time and, with enough poses, its square, without their means, shape (k, 1 or 2)."""
     powers = np.column_stack([time, time**2][:2 if count >= 2 * SPARE else 1])
     return powers - powers.mean(axis=0)
 
 
 def _of_norms(time, residual, base):
-    """The course of the accelerometer's bias: only its component along gravity shows in a pose."""
+    """The drift of the accelerometer's bias: only its component along gravity is observable in a pose."""
     back = base[:, 0:3]
     powers = _powers(time, len(time) - base.shape[1] - 3)
     added = np.hstack([power[:, None] * back for power in powers.T])
@@ -91,13 +91,13 @@ def _shown(before, after, added, spare):
 
 
 def without_movement(poses: Poses, movements: Mapping[str, BiasMovement]) -> Poses:
-    """Return the poses as they would be with the accelerometer's bias at its mean; the gyroscope's may differ from pose to pose anyway."""
+    """Return the poses with the accelerometer's bias at its mean; the gyroscope's may differ between poses anyway."""
     moved = movements.get('accelerometer')
     return poses if moved is None else replace(poses, force=poses.force - moved.course)
 
 
 def with_movement(covariance: np.ndarray, model: HandModel, movements: Mapping[str, BiasMovement]) -> np.ndarray:
-    """Return the covariance with what moved in it: the bias of any moment of the recording lies within one sd of the mean reported."""
+    """Return the covariance with the drift: the bias at any time of the recording is within one sd of the reported mean."""
     grown = covariance.copy()
     for sensor, movement in movements.items():
         index = model.index_of(sensor)[:len(movement.growth)]
@@ -109,7 +109,7 @@ def with_movement(covariance: np.ndarray, model: HandModel, movements: Mapping[s
 
 
 def notes(moved: Mapping[str, float], duration: float) -> tuple[CheckFinding, ...]:
-    """Return what a user should know: sensor -> distance moved in SI, over `duration` s."""
+    """Return the notes for the user: sensor -> distance moved in SI, over `duration` s."""
     span = f'{duration / 60:.0f} minutes' if duration >= 90 else f'{duration:.0f} s'
     sizes = {'accelerometer': (1e3 / STANDARD_GRAVITY, 'mg'), 'gyroscope': (1 / DEG, 'deg/s')}
     return tuple(CheckFinding('bias_drift', WARNING, f'{sensor} bias moved by {size * sizes[sensor][0]:.2g} {sizes[sensor][1]} in {span}, '

@@ -1,4 +1,4 @@
-"""One mind for `calibrate` and `diagnose` by hand: what the poses and turns demand is in the model."""
+"""Common model selection for `calibrate` and `diagnose` by hand: the model has the effects that the poses and turns support."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,27 +17,27 @@ from imu_calibration.estimation.covariance_terms import REJECTED, with_term
 
 @dataclass(frozen=True, eq=False)
 class EvidentHand:
-    """A calibration by hand with what was found on the way to its model."""
+    """A calibration by hand with the search results of its model."""
 
     hand: HandCalibration
     """The calibration."""
     found: HandInvestigation | None = None
-    """What was asked and answered; None with too few poses, or when nothing was asked."""
+    """Search result; None with too few poses, or without a search."""
     changes: ModelChanges = ModelChanges()
-    """What the recording did to the model that was asked for."""
+    """Changes of the requested model by the evidence."""
 
 
 def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, as_asked: bool = False,
                       progress: Callable | None = None) -> EvidentHand:
     """
-    Estimate from poses and turns, with what they demand on top of the model that is asked for (`investigate_by_hand`).
+    Estimate from poses and turns, with the supported effects in addition to the requested model (`investigate_by_hand`).
 
     Parameters
     ----------
     data : HandData
     options : HandOptions
     as_asked : bool
-        Whether the model is exactly what was asked for.
+        Whether the model is exactly the requested one.
     progress : callable, optional
         Called with the share of the search that is done.
 
@@ -59,7 +59,7 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
 
 
 def _solved(data, found, options):
-    """Return the calibration with the model that is asked for and what was found; that of the search where it is the same."""
+    """Return the calibration with the requested model and the findings; if the model is unchanged, the one of the search."""
     asked, names, base = _asked(data, options), found.names, found.baseline.model.model
     same = all(getattr(base, sensor) == _joined(asked[sensor], names[sensor]) for sensor in SENSORS)
     return found.baseline if same and not (found.denied or found.implausible) else extended_by_hand(data, found, options)
@@ -78,7 +78,7 @@ def _faint(hand, found, asked):
 
 
 def extended_by_hand(data: HandData, found: HandInvestigation, options: HandOptions) -> HandCalibration:
-    """Return the calibration with the model that is asked for and what was found; what is denied or implausible widens its covariance."""
+    """Return the calibration with the requested model and the findings; denied or implausible effects increase its covariance."""
     asked, names = _asked(data, options), found.names
     hand = solve_by_hand(data, replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS}), found.point())
     terms = hand.terms

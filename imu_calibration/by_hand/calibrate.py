@@ -34,13 +34,13 @@ GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
 PUBLISHED = tuple(SensorModel().param_names)
 """Order of the parameters in the result; further effects follow."""
 POSES_LEAST = 4
-"""Fewer attitudes leave even the accelerometer's biases to the prior."""
+"""With fewer attitudes even the accelerometer's biases are determined by the prior."""
 PASSES = 4
-"""Solutions at most, when the columns of a warm-up have to be taken anew or poses and turns are left out."""
+"""Largest number of solutions, when the columns of a warm-up are recomputed or poses and turns are excluded."""
 SETTLED = 0.03
-"""Relative change of a time constant below which its columns stay."""
+"""Relative change of a time constant below which its columns are not recomputed."""
 POSES_FULL = 12
-"""The nine accelerometer parameters take one equation per attitude; the others estimate the scatter of the poses."""
+"""The nine accelerometer parameters need one equation per attitude; further ones determine the scatter of the poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class HandCalibration:
     statuses: tuple
     """'determined', 'weak' or 'held' for each parameter."""
     tolerances: np.ndarray
-    """Sd that would be good enough, shape (n,)."""
+    """Sufficient standard deviation, shape (n,)."""
     priors: np.ndarray
     """Sd before any data, shape (n,)."""
     gravity: float
@@ -70,15 +70,15 @@ class HandCalibration:
     state: State
     """Directions and drifts of the poses, and the parameters in the order of `model`."""
     model: HandModel
-    """What was estimated."""
+    """Estimated parameters."""
     information: np.ndarray
-    """Information of the data alone, in the order of `model`, shape (m, m)."""
+    """Information of the data without priors, in the order of `model`, shape (m, m)."""
     used_poses: Poses
-    """The poses as they were weighed: those left out with means that count for nothing, a bias that moves at its mean."""
+    """The poses as weighted: excluded ones with negligible weight, a drifting bias at its mean."""
     used_turns: list
-    """`TurnData` that were not left out."""
+    """`TurnData` without excluded turns."""
     model_error: ModelError
-    """What the covariance grew by, beyond noise and scatter, in the order of `model`."""
+    """Increase of the covariance beyond noise and scatter, in the order of `model`."""
     replaced: tuple[str, ...] = ()
     """Weak parameters that were replaced by their prior."""
 
@@ -89,7 +89,7 @@ class HandCalibration:
 
     @cached_property
     def advice(self) -> tuple[dict, ...]:
-        """({'parameters': {name: sd over tolerance}, 'needs': the next step}, ...) for what is not determined."""
+        """({'parameters': {name: sd over tolerance}, 'needs': the next step}, ...) for undetermined parameters."""
         return missing_motion(self)
 
     @property
@@ -119,7 +119,7 @@ class HandCalibration:
 
     def compensate(self, force: np.ndarray, rate: np.ndarray, time: np.ndarray | None = None, *,
                    temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return true specific force and rate for readings of shape (n, 3), at `time` s and `temperature_c` where effects ask for them."""
+        """Return true specific force and rate for readings of shape (n, 3), at `time` s and `temperature_c` for effects that need them."""
         return self.model.compensate(self.state.values, force, rate, time=time, temperature_c=temperature_c)
 
     def norm_residuals(self, force: np.ndarray | None = None) -> np.ndarray:
@@ -137,7 +137,7 @@ def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), sti
 
     One weighted least-squares system: ``force_k = bias + matrix @ gravity u_k`` in pose k, ``C u_i = u_j`` for the turn from
     pose i to j with C integrated from the rates, ``rate_k = bias + drift_k`` at rest. Scatter beyond the noise of poses,
-    drifts and turns is estimated along. A wrong gravity is the same as a common scale of the accelerometer.
+    drifts and turns is estimated as well. A wrong gravity is equivalent to a common scale of the accelerometer.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), sti
     stills : sequence of slices or (start, stop), optional
         Intervals at rest; found by `static_detector.find_still` when not given.
     known_turns : sequence of KnownTurn
-        Full turns by hand, beside what gravity says.
+        Full turns by hand, in addition to gravity as reference.
     temperature_c : array, optional
         Temperature at the samples, degrees Celsius, shape (n,).
 
@@ -168,14 +168,14 @@ def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), sti
 
 @dataclass(frozen=True, eq=False)
 class HandData:
-    """What a recording without a table says: poses and turns."""
+    """Poses and turns of a recording without a table."""
 
     poses: Poses
     """Means over the intervals at rest."""
     turns: list
     """`TurnData` between consecutive poses, then those of known angle."""
     statistics: dict
-    """Attitudes, turns left out, noise and period of the samples."""
+    """Attitudes, excluded turns, noise and period of the samples."""
 
 
 def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, settings: ByHandSettings = ByHandSettings(), *,
@@ -196,9 +196,9 @@ def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, settings: By
 
 def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = None) -> HandCalibration:
     """
-    Estimate from poses and turns that are at hand.
+    Estimate from given poses and turns.
 
-    See `calibrate_by_hand`. `point`: effect -> values where its columns are first taken.
+    See `calibrate_by_hand`. `point`: effect -> values at which its columns are first computed.
     """
     report('solving')
     poses, turns, settings = data.poses, data.turns, options.settings
@@ -231,7 +231,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
         poses = without_movement(poses, movements)
         found = solved(model, poses, turns)
     terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
-    used, poses = poses, data.poses   # as they are: what was left out, or moved, is for everybody to see
+    used, poses = poses, data.poses   # the result has all poses unchanged, also excluded and drifting ones
     goals = model.tolerances(options.tolerances)
     status = statuses(np.sqrt(np.diag(total(terms))), found.held, goals)
     statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
@@ -261,7 +261,7 @@ def with_weak_replaced(hand: HandCalibration) -> HandCalibration:
 
 
 def _settled(model, found):
-    """Return whether the columns of warm-ups were taken close enough to where the solution lies."""
+    """Return whether the columns of warm-ups were computed close enough to the solution."""
     for effect in model.extras:
         part = model.parts[effect.key]
         if effect.time_constant and not found.held[part][-1]:
@@ -278,7 +278,7 @@ def _check_temperature(model, poses):
 
 
 def default_gyroscope(poses: Poses, settings: ByHandSettings) -> tuple[tuple[str, ...], dict]:
-    """Return (the gyroscope's effects when nothing is asked for, what the poses say about g-sensitivity)."""
+    """Return (the gyroscope's effects without a request, the evidence of the poses for g-sensitivity)."""
     if settings.g_sensitivity not in ('auto', 'on', 'off'):
         raise InputError(f"setting 'g_sensitivity' must be auto, on or off, got {settings.g_sensitivity!r}; choose one of them",
                          code='choice_unknown')

@@ -1,4 +1,4 @@
-"""Is a calibration still good? Its proof on a recording without a table: gravity at rest, rates at rest, and turns between poses."""
+"""Verification of a calibration on a recording without a table: gravity at rest, rates at rest, and turns between poses."""
 
 from collections.abc import Callable
 
@@ -24,9 +24,9 @@ def check_by_hand(source: Callable, calibration: Calibration, options: Calibrati
     """
     Prove a calibration on a recording of its IMU held still in some attitudes, with turns between them.
 
-    The error of the accelerometer is the length of its mean reading in a pose less gravity; that of the gyroscope the angle by which it
-    carries gravity past the pose that a turn ends in, and its mean reading at rest. Before: readings as they come; after: as compensation
-    corrects them. Directions of gravity are those of the corrected accelerometer for both.
+    The error of the accelerometer is the length of its mean reading in a pose less gravity; that of the gyroscope the angle between gravity
+    rotated by its rates and gravity in the pose at the end of a turn, and its mean reading at rest. Before: readings unchanged; after: as
+    corrected by compensation. Directions of gravity are those of the corrected accelerometer for both.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def check_by_hand(source: Callable, calibration: Calibration, options: Calibrati
     calibration : Calibration
         From a table or by hand.
     options : CalibrationOptions
-        The local gravity, where it is not that of the calibration, and the conversion of volts or counts.
+        The local gravity, if it differs from that of the calibration, and the conversion of volts or counts.
 
     Raises
     ------
@@ -56,12 +56,12 @@ def check_by_hand(source: Callable, calibration: Calibration, options: Calibrati
 
 
 def gravity_of(calibration: Calibration, options: CalibrationOptions) -> float:
-    """Return the gravity that readings at rest are compared with, m/s^2: what was given, else that of the calibration."""
+    """Return the reference gravity for readings at rest, m/s^2: the given one, or that of the calibration."""
     return options.gravity or calibration.conditions.get('gravity') or STANDARD_GRAVITY
 
 
 def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gravity: float) -> dict:
-    """Return the proof of corrected samples `after` beside those as they came: sensor -> entry of a document (see `calibration.proof`)."""
+    """Return the proof of corrected samples `after` against the raw ones: sensor -> entry of a document (see `calibration.proof`)."""
     poses, turns = data.poses, [turn for turn in data.turns if turn.rotation is None]
     ranges = [slice(start, stop) for start, stop in zip(poses.start, poses.stop, strict=True)]
     (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))

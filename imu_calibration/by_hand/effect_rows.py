@@ -29,9 +29,9 @@ class Block:
     known: np.ndarray
     """Variance by the noise of the samples, shape (m, n_axes)."""
     floor: np.ndarray
-    """The same with the way in which every bias moves, shape (m, n_axes)."""
+    """The same plus the usual bias drift, shape (m, n_axes)."""
     pose: np.ndarray
-    """Pose of each row, that before it for a turn, shape (m,)."""
+    """Pose of each row (of a turn: the pose before it), shape (m,)."""
     time: np.ndarray
     """Seconds since the first sample, shape (m,)."""
     duration: np.ndarray | None = None
@@ -45,7 +45,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class HandSpace:
-    """Parameters of a diagnosis by hand: those of the baseline, the Earth's rate about the vertical, then one run per column set."""
+    """Parameters of a diagnosis by hand: baseline, Earth's rate about the vertical, then one run per column set."""
 
     names: tuple
     """Label of each run of columns: effect name, for a warm-up with the number of its time constant."""
@@ -69,9 +69,9 @@ def build_rows(hand: HandCalibration, turns: Sequence[TurnData], effects: Sequen
     turns : list of TurnData
         Between consecutive poses.
     effects : sequence of Effect
-        That are asked about.
+        Effects under test.
     constants : array
-        Time constants at which warm-ups are asked about, s.
+        Time constants of warm-ups under test, s.
 
     """
     sets: list[tuple[Effect, str, float | None]] = [(effect, effect.name, None) for effect in effects if not effect.time_constant]
@@ -95,7 +95,7 @@ def build_rows(hand: HandCalibration, turns: Sequence[TurnData], effects: Sequen
 
 
 def _columns(hand, effect, tau, force, rate, time, temperature_c):
-    """Return what the effect's parameters add to its sensor's output, shape (m, 3, p), at the baseline's solution."""
+    """Return the contribution of the effect's parameters to its sensor's output, shape (m, 3, p), at the baseline's solution."""
     point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
     names = {sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS}
     model = HandModel(replace(hand.model.model, **names, point=point), hand.gravity)
@@ -105,7 +105,7 @@ def _columns(hand, effect, tau, force, rate, time, temperature_c):
 
 
 def _natural(poses, sensor):
-    """Return the variance by which every bias moves, shape (3,)."""
+    """Return the variance of the usual bias drift, shape (3,)."""
     return NATURAL**2 * poses.noise[sensor].white_variance * poses.period
 
 
@@ -125,7 +125,7 @@ def _norm_block(hand, space, at_rest, sensor_of):
 
 
 def _rest_block(hand, space, at_rest, sensor_of):
-    """Three rows per pose: the rate at rest, with what the Earth turns about the vertical."""
+    """Three rows per pose: the rate at rest, with the Earth's rate about the vertical."""
     poses, count = hand.poses, len(hand.poses.start)
     true = hand.gravity * hand.state.up
     more, slopes = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time,
@@ -145,10 +145,10 @@ def _rest_block(hand, space, at_rest, sensor_of):
 
 def _turn_block(hand, turns, space, at_rest, moving):
     """
-    Two rows per turn: the direction after it against that carried there by the rates, over the turn's duration.
+    Two rows per turn: the direction after it against the direction before it rotated by the rates, over the turn's duration.
 
-    The bias in a turn is the mean of the rates at rest before and after it, so that its movement does not enter; with it goes what
-    further effects add at rest.
+    The bias in a turn is the mean of the rates at rest before and after it, which removes its drift; the contributions of
+    further effects at rest are removed with it.
     """
     bias_f, matrix_f = hand.accelerometer
     matrix = hand.gyroscope[1]

@@ -15,7 +15,7 @@ COMPONENTS = ('pose', 'drift', 'turn')
 
 
 NEAR = 1e-3
-"""rad; the square of it, times a turn's few radians, is what first order leaves out."""
+"""rad; its square, times a turn's few radians, is the error of the first-order correction."""
 CALM = 0.05
 """Least scatter of the drifts in units of the noise of the means, so that no row has infinite weight."""
 
@@ -45,7 +45,7 @@ class Poses:
     period: float = 0.0
     """Time from sample to sample, s."""
     half_turn: np.ndarray | None = None
-    """By how much the attitude creeps across gravity from the middle of each interval to its end, rad, shape (k, 3); not in `rate`."""
+    """Angle by which the attitude creeps across gravity from the middle of each interval to its end, rad, shape (k, 3); not in `rate`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class TurnData:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Everything that is estimated."""
+    """Estimated quantities."""
 
     values: np.ndarray
     """Parameters in the order of the `HandModel`, shape (n,)."""
@@ -127,7 +127,7 @@ def build_system(model: HandModel, state: State, poses: Poses, *, turns: Sequenc
     poses : Poses
     turns : list of TurnData
     memory : dict, optional
-        Turns integrated before; near their parameters they are corrected to first order instead of being integrated anew.
+        Turns integrated before; for similar parameters they are corrected to first order instead of being integrated again.
 
     """
     memory = {} if memory is None else memory
@@ -140,7 +140,7 @@ def build_system(model: HandModel, state: State, poses: Poses, *, turns: Sequenc
 
 
 def _pose_rows(model, state, poses, across):
-    """``force = bias + matrix @ (gravity * up) + further effects``: three rows per pose, two of them spent on its direction."""
+    """``force = bias + matrix @ (gravity * up) + further effects``: three rows per pose, two of them used for its direction."""
     bias, matrix, *_ = unpack(state.values)
     count = len(state.up)
     true = model.gravity * state.up
@@ -171,7 +171,7 @@ def _drift_rows(model, state, poses):
 
 
 def _calm_rows(model, state, poses):
-    """``0 = drift`` within its own scatter."""
+    """``0 = drift`` within the scatter of the drifts."""
     count = len(state.up)
     return _flat(-state.drift, _drift_columns(count), np.zeros((count, 3, model.size)), (CALM * poses.rate_sem)**2, 1)
 
@@ -184,7 +184,7 @@ def _drift_columns(count):
 
 
 def _integrated(model, state, data, bias, key, memory):
-    """Return (mat_ji, Turn), from memory when the gyroscope's parameters have hardly moved since."""
+    """Return (mat_ji, Turn), from memory when the gyroscope's parameters have hardly changed since."""
     matrix, further = unpack(state.values)[3], state.values[model.extra_index('gyroscope')]
     if key in memory:
         (old_bias, old_matrix, old_further), turn = memory[key]
@@ -205,7 +205,7 @@ def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndar
 
 
 def _gravity_turn_rows(model, state, data, key, memory, across, poses):
-    """The direction before the turn, carried along by the gyroscope, against the direction after it: two rows, from middle to middle."""
+    """The direction before the turn, rotated by the gyroscope, against the direction after it: two rows, from middle to middle."""
     count, i, j = len(state.up), data.first, data.last
     mat_ji, turn = _integrated(model, state, data, state.values[GYRO_BIAS] + 0.5 * (state.drift[i] + state.drift[j]), key, memory)
     mat_ji = between_middles(poses, data, mat_ji)

@@ -1,4 +1,4 @@
-"""Evidence from a recording without a table: few poses, so that variances are estimated along and every pose is held out in turn."""
+"""Evidence from a recording without a table: few poses, so that variances are estimated too and every pose is held out in turn."""
 
 from functools import cached_property
 from typing import Sequence
@@ -13,23 +13,23 @@ from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.selection.evidence import Evidence
 
 FOLDS = 12
-"""Parts that poses are dealt into; with up to `ONE_BY_ONE` poses each is a part of its own."""
+"""Number of folds of the poses; with up to `ONE_BY_ONE` poses each pose is a fold."""
 ONE_BY_ONE = 24
 OFFSETS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
-"""Scatter of poses or turns beyond the noise of their samples that is tried, in units of that noise."""
+"""Candidate scatter of poses or turns beyond the noise of their samples, in units of that noise."""
 BIASES = (0.0, 0.5, 1.0, 2.0, 4.0)
-"""Bias process that is tried, in units of offset and noise together."""
+"""Candidate bias processes, in units of offset and noise together."""
 TIMES = (100.0, 300.0)
 """Its correlation times, s."""
 ALIKE = 0.1
-"""Columns that differ by less than this count as one."""
+"""Columns that differ by less than this count as collinear."""
 UNIQUE = 0.2
-"""Least sine of the angle between a column and what the baseline explains for the column to count."""
+"""Least sine of the angle between a column and the baseline's columns for the column to count."""
 
 
 class HandEvidence(Evidence):
     """
-    Losses of choices of parameters on all poses and on those held out.
+    Losses of choices of parameters on all poses and on held-out poses.
 
     Losses are ``n log(mean square)`` per block: the variance is not known but estimated from the same few rows.
 
@@ -38,9 +38,9 @@ class HandEvidence(Evidence):
     blocks : sequence of Block
     space : HandSpace
     smooth : sequence of int
-        Parameters of effects that are smooth in time, beside which the noise is estimated.
+        Parameters of effects that are smooth in time, included when the noise is estimated.
     baseline : sequence of int
-        Parameters of the model that is diagnosed.
+        Parameters of the model under diagnosis.
 
     """
 
@@ -72,7 +72,7 @@ class HandEvidence(Evidence):
                 for number in (None, *range(self.n_folds))}
 
     def normal(self, number: int | None = None) -> np.ndarray:
-        """Return the normal matrix of all rows, or of those outside fold `number`, whitened without it."""
+        """Return the normal matrix of all rows, or of the rows outside fold `number`, whitened without it."""
         return self._normals[number]
 
     def residuals(self, used: Sequence[int]) -> list[np.ndarray]:
@@ -81,12 +81,12 @@ class HandEvidence(Evidence):
         return [block.rows[:, :, -1] - block.rows[:, :, list(used)] @ values for block in self.blocks]
 
     def heldout_residuals(self, used: Sequence[int]) -> list[np.ndarray]:
-        """Return the residual of every row under the fit that did not see its pose, shape (m, n_axes) per block."""
+        """Return the residual of every row under the fit without its pose, shape (m, n_axes) per block."""
         values, index = np.array([self.fit(used, number)[0] for number in range(self.n_folds)]), list(used)
         return [b.rows[:, :, -1] - np.einsum('map,mp->ma', b.rows[:, :, index], values[fold]) for b, fold in zip(self.blocks, self.folds)]
 
     def heldout(self, used: Sequence[int]) -> float:
-        """Return the loss of all poses when each is held out in turn; a search asks of the same choice beside each effect."""
+        """Return the loss of all poses when each is held out in turn; cached, because a search repeats choices for each effect."""
         ordered = tuple(sorted(used))
         key = ('held out', *ordered)
         if key not in self._losses:
@@ -103,7 +103,7 @@ class HandEvidence(Evidence):
         return white[:, -1] - white[:, list(used)] @ self.fit(used)[0]
 
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
-        """Return the p-value of `larger` against `smaller`: F test on the blocks in which the new columns stand."""
+        """Return the p-value of `larger` against `smaller`: F test on the blocks that contain the new columns."""
         added = [k for k in larger if k not in set(smaller)]
         concerned = [white for white in self._white if np.any(white[:, added])]
         squares = [sum(np.sum(self._left(white, used)**2) for white in concerned) for used in (smaller, larger)]
@@ -115,7 +115,7 @@ class HandEvidence(Evidence):
         return float(f_sf(max(squares[0] - squares[1], 0.0) / rank / (squares[1] / spare), rank, spare))
 
     def rank(self, added: Sequence[int], smaller: Sequence[int]) -> int:
-        """Return how many combinations of the added columns the smaller choice cannot imitate."""
+        """Return how many combinations of the added columns are not collinear with the smaller choice."""
         white = np.concatenate(self._white)
         known, new = _basis(white[:, list(smaller)]), _basis(white[:, list(added)], ALIKE)
         if not new.shape[1]:
@@ -135,7 +135,7 @@ def _basis(columns, least=1e-9):
 
 
 def _noise(block, used):
-    """Return (independent variance of each row (m, n_axes), bias processes): scatter from row to row, for poses a bias process too."""
+    """Return (independent variance of each row (m, n_axes), bias processes): scatter between rows, for poses a bias process too."""
     count, axes, width = block.rows.shape
     basis = _basis(block.rows.reshape(-1, width)[:, used])
     rows = np.concatenate([basis.reshape(count, axes, -1), block.rows[:, :, -1:]], axis=2)

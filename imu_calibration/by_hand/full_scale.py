@@ -1,4 +1,4 @@
-"""The factor by which the readings of a gyroscope are wrong as a whole, from the directions of gravity before and after each turn."""
+"""The full-scale factor of a gyroscope, from the directions of gravity before and after each turn."""
 
 from collections.abc import Sequence
 
@@ -11,14 +11,14 @@ from imu_calibration.preflight.full_scale import LEAST_TURNS, MOST_TURNS, believ
 
 def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> float:
     """
-    Return the factor between measured and true rates, 1 when they carry gravity to where it is found (`preflight.full_scale`).
+    Return the factor between measured and true rates, 1 if the rotated gravity matches its observed direction (`preflight.full_scale`).
 
-    Only turns that gravity is the reference of count; the bias of each is the mean of the rates at rest before and after it.
+    Only turns with gravity as reference count; the bias of each is the mean of the rates at rest before and after it.
 
     Parameters
     ----------
     state : State
-        Directions of gravity from the norms alone.
+        Directions of gravity from the norms.
     poses : Poses
     turns : sequence of TurnData
 
@@ -34,7 +34,7 @@ def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> 
 
 
 def missed_angle(state: State, poses: Poses, turn: TurnData, *, matrix: np.ndarray) -> float:
-    """Return by how much gravity misses its direction after a turn when the gyroscope reads `matrix` times the rate, rad."""
+    """Return the angle between rotated and observed gravity after a turn when the gyroscope reads `matrix` times the rate, rad."""
     bias = 0.5 * (poses.rate[turn.first] + poses.rate[turn.last])
     mat_ji = integrate_turn(turn.time, turn.rate, bias=bias, matrix=matrix).mat_ji
     return float(np.arccos(np.clip(mat_ji @ state.up[turn.first] @ state.up[turn.last], -1.0, 1.0)))

@@ -1,4 +1,4 @@
-"""Does the gyroscope at rest follow gravity? Asked of the poses beside time: a warm-up follows their order, and so may gravity."""
+"""Test of the gyroscope's g-sensitivity at rest, given a drift in time: the order of the attitudes may correlate with a warm-up."""
 
 import numpy as np
 import scipy.linalg
@@ -8,36 +8,36 @@ from imu_calibration.by_hand.equations import Poses
 from imu_calibration.reference.earth import EARTH_RATE
 
 SPARE = 8
-"""With fewer poses beyond the columns the choice of the wander alone explains too much."""
+"""With fewer poses beyond the columns the choice of the bias process explains too much."""
 CHOSEN = 2
-"""Share and correlation time are taken from the data as well."""
+"""Share and correlation time are estimated from the data as well."""
 SHARES = (0.0, 0.5, 0.8, 0.95, 0.99)
-"""Shares of the scatter from pose to pose that wander in time, tried one after the other."""
+"""Candidate shares of the bias process in the scatter between poses."""
 TIMES = (0.1, 0.3, 1.0, 3.0)
-"""Correlation times of the wander that are tried, in units of the time from the first pose to the last."""
+"""Candidate correlation times of the bias process, in units of the time from the first pose to the last."""
 SILENT = {'g_sensitivity_p_value': 1.0, 'g_sensitivity_heldout_ratio': 1.0}
 P_VALUE = 1e-3
-"""The response of the gyroscope to gravity enters the model when chance would show it less often."""
+"""The g-sensitivity enters the model below this p-value."""
 EARTH_UPWARDS_SD = EARTH_RATE / np.sqrt(3)
 """
-The Earth turns about the vertical by its rate times the sine of the latitude, which follows gravity as the same response of every axis
-does. Where nobody says the latitude it is anything up to the whole rate, rad/s.
+The Earth's rate about the vertical is its rate times the sine of the latitude, equivalent to an equal response of every axis to
+gravity. For an unknown latitude it is anything up to the full rate, rad/s.
 """
 
 
 def g_sensitivity_evidence(poses: Poses) -> dict:
     """
-    Test whether the gyroscope's readings at rest follow the direction of gravity, beyond what time and temperature explain.
+    Test whether the gyroscope's readings at rest correlate with the direction of gravity, given drift in time and with temperature.
 
-    ``rate = bias(time, temperature) + sensitivity @ force + earth * up + error``: the Earth's rate about the vertical comes off first, as
-    far as the readings show it and it may go; the bias is a parabola in time, with a term in temperature where that
-    was recorded, and the error wanders, by a share and with a correlation time that restricted likelihood chooses beside all columns.
+    ``rate = bias(time, temperature) + sensitivity @ force + earth * up + error``: the Earth's rate about the vertical is subtracted first,
+    as estimated from the readings within its physical limits; the bias is a parabola in time, with a term in temperature if it
+    was recorded, and the error contains a bias process whose share and correlation time are estimated by restricted likelihood.
 
     Returns
     -------
     dict
-        `g_sensitivity_p_value` of the F test against the bias alone, and `g_sensitivity_heldout_ratio`, the rms with over that without it
-        for poses left out one at a time.
+        `g_sensitivity_p_value` of the F test against the bias model, and `g_sensitivity_heldout_ratio`, the rms with over that without it
+        for poses held out one at a time.
 
     """
     count = len(poses.force)
@@ -61,7 +61,7 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
 
 
 def shown(evidence: dict) -> bool:
-    """Return whether the poses show the g-sensitivity clearly enough for it to enter the model by itself."""
+    """Return whether the g-sensitivity is significant enough to enter the model without a request."""
     return evidence['g_sensitivity_p_value'] < P_VALUE and evidence['g_sensitivity_heldout_ratio'] < 1
 
 
@@ -74,7 +74,7 @@ def _covariances(time):
 
 
 def _loss(covariance, design, values):
-    """Return minus twice the restricted log likelihood, the scale of each axis at its best."""
+    """Return minus twice the restricted log likelihood, with the best scale of each axis."""
     factor = np.linalg.cholesky(covariance)
     white = scipy.linalg.solve_triangular(factor, np.hstack([design, values]), lower=True)
     orthogonal, triangle = np.linalg.qr(white[:, :design.shape[1]])
@@ -85,7 +85,7 @@ def _loss(covariance, design, values):
 
 
 def _left(covariance, design, values):
-    """Return the weighted squares that a fit leaves, shape (3,), and the error of each value predicted from the others, shape (k, 3)."""
+    """Return the weighted residual sum of squares of a fit, shape (3,), and the leave-one-out prediction errors, shape (k, 3)."""
     inverse = np.linalg.inv(covariance)
     weighted = inverse @ design
     projector = inverse - weighted @ np.linalg.solve(design.T @ weighted, weighted.T)

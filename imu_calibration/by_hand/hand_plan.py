@@ -1,4 +1,4 @@
-"""Poses and turns of a hand, planned as a whole by the planner that also says the next one (`advice`)."""
+"""A complete plan of poses and turns by hand, by the planner of the next pose (`advice`)."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from imu_calibration.estimation.noise_model import NoiseModel
 
 @dataclass(frozen=True, eq=False)
 class HandPlan:
-    """Poses and turns one after the other, and what they promise."""
+    """A sequence of poses and turns, with its predicted standard deviations."""
 
     steps: tuple[HandStep, ...]
     """In the order of time."""
     seconds: float
-    """Time that a person takes, s."""
+    """Duration, s."""
     param_names: tuple[str, ...]
     """Parameters, in the order of the standard deviations."""
     sd: np.ndarray
@@ -34,7 +34,7 @@ class HandPlan:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Parameters that stay outside their tolerance."""
+        """Parameters that remain outside their tolerance."""
         return tuple(name for name, sd, tolerance in zip(self.param_names, self.sd, self.tolerances, strict=True) if sd > tolerance)
 
 
@@ -66,7 +66,7 @@ def plan_by_hand(model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str
 
 
 def hand_plan_to_mapping(plan: HandPlan, provenance: dict[str, Any]) -> dict[str, Any]:
-    """Return what plan.yaml holds of a plan by hand: plain data, SI."""
+    """Return the contents of plan.yaml for a plan by hand: plain data, SI."""
     return {'format': 'imu_calibration/plan/1', 'seconds': round(plan.seconds, 3), 'lower_bound_seconds': None,
             'motions': [_step(step) for step in plan.steps],
             'parameters': {name: {'sd': float(f'{sd:.6g}'), 'tolerance': float(f'{tolerance:.6g}'), 'met': bool(sd <= tolerance)}

@@ -1,4 +1,4 @@
-"""What a person does by hand: a turn to one of 26 attitudes and a rest there; how long that takes, how it is said, what the turn shows."""
+"""Steps by hand: a turn to one of 26 attitudes and a rest there; duration, description, and rows of the turn."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from imu_calibration.effects.base import AXES
 from imu_calibration.reference.reference_motion import skew
 
 HOLD = 3.0
-"""s; how long a pose is held until it counts for sure."""
+"""s; hold time after which a pose certainly counts."""
 TURN_BEGINS, TURN_RATE = 0.5, 60.0 * DEG
-"""s, rad/s; what a person takes to begin and to end a turn, and how fast it goes."""
+"""s, rad/s; time to begin and to end a turn, and its rate."""
 TURNED = 0.35
-"""rad, 20 degrees: smaller turns between two poses tell the gyroscope little and are easily made wrong."""
+"""rad, 20 degrees: smaller turns between two poses carry little information about the gyroscope and are easily made wrong."""
 ROUNDED = 15
-"""deg, to which a turn is said to a person."""
+"""deg, rounding of a turn in instructions."""
 
 
 @dataclass(frozen=True, eq=False)
 class HandStep:
-    """What a person does: a turn to an attitude, and a rest there."""
+    """A turn to an attitude, and a rest there."""
 
     up: np.ndarray
     """Direction of the sensor that points up then, unit vector, shape (3,)."""
     axis: np.ndarray | None = None
     """Axis of the sensor to turn about, counter-clockwise seen from its tip; None: from anywhere."""
     angle: float = 0.0
-    """How far, rad."""
+    """Angle of the turn, rad."""
 
     @property
     def seconds(self) -> float:
-        """How long that takes, s."""
+        """Duration, s."""
         return HOLD + TURN_BEGINS + (0.5 * np.pi if self.axis is None else self.angle) / TURN_RATE
 
     @property
@@ -46,7 +46,7 @@ class HandStep:
 
     @property
     def words(self) -> str:
-        """What to do."""
+        """Instruction."""
         hold = f'hold it still with {direction_words(self.up)} up'
         if not self.is_turn:
             return hold
@@ -55,7 +55,7 @@ class HandStep:
 
 
 def direction_words(up: np.ndarray) -> str:
-    """Return a standard direction for people: '+x -z'."""
+    """Return the name of a standard direction: '+x -z'."""
     return ' '.join(f'{"+" if c > 0 else "-"}{a}' for c, a in zip(up, AXES) if abs(c) > 1e-9)
 
 
@@ -68,7 +68,7 @@ def shortest_turn(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, float
 
 
 def turn_rows(start: np.ndarray | None, end: np.ndarray) -> np.ndarray:
-    """Return what the shortest turn from one direction up to another shows of the gyroscope's matrix, shape (2, 9)."""
+    """Return the design of the shortest turn from one direction up to another for the gyroscope's matrix, shape (2, 9)."""
     if start is None:
         return np.zeros((2, 9))
     about, angle = shortest_turn(start, end)
@@ -79,11 +79,11 @@ def turn_rows(start: np.ndarray | None, end: np.ndarray) -> np.ndarray:
 
 
 def steps_from(up: np.ndarray | None) -> tuple[tuple[HandStep, ...], np.ndarray]:
-    """Return the step to each of `DIRECTIONS`, by the shortest turn from what is up, and the `turn_rows` of each, shape (26, 2, 9)."""
+    """Return the step to each of `DIRECTIONS`, by the shortest turn from the current one, and the `turn_rows` of each, shape (26, 2, 9)."""
     return _steps_from(None if up is None else tuple(up.tolist()))
 
 
-@lru_cache(maxsize=256)   # a plan goes from direction to direction, and another one through the same again
+@lru_cache(maxsize=256)   # plans revisit the same directions
 def _steps_from(up):
     start = None if up is None else np.array(up)
     steps = tuple(HandStep(to) if start is None else HandStep(to, *shortest_turn(start, to)) for to in DIRECTIONS)
@@ -95,6 +95,6 @@ def _steps_from(up):
 def rotation_slopes(about: np.ndarray, angle: float = np.pi) -> np.ndarray:
     """Return the derivative of the rotation error in the turned frame by the gyroscope's matrix, near the identity, shape (3, 9)."""
     cross = skew(about)
-    # integral over the turn of the rotation still to come, C(angle - t)
+    # integral over the turn of the remaining rotation, C(angle - t)
     to_come = angle * np.outer(about, about) + np.sin(angle) * (np.eye(3) - np.outer(about, about)) - (1 - np.cos(angle)) * cross
     return -np.einsum('ip,q->ipq', to_come, about).reshape(3, 9)

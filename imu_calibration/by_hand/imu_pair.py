@@ -1,4 +1,4 @@
-"""Two IMUs on one rigid body: their readings calibrated by hand, and how B's axes and clock lie against A's."""
+"""Two IMUs on one rigid body: readings calibrated by hand, and rotation and time offset of B relative to A."""
 
 from dataclasses import dataclass
 
@@ -39,11 +39,11 @@ class PairedImu:
     rate: np.ndarray
     """Angular rate, own frame, rad/s, shape (n, 3)."""
     flagged: np.ndarray
-    """Samples at the end of the range or beside a hole, shape (n,)."""
+    """Samples at the end of the range or next to a hole, shape (n,)."""
     calibration: HandCalibration | None
-    """What compensated it; None: the rates' bias at rest alone."""
+    """Calibration applied; None: only the rates' bias at rest was removed."""
     poses: Poses | None
-    """Poses that the calibration was made from, where it was made here."""
+    """Poses of a calibration from the same recording."""
     period: float
     """Median step, s."""
 
@@ -52,7 +52,7 @@ class PairedImu:
              settings: ArmSettings) -> 'PairedImu':
         """Compensate the samples of one IMU, with a calibration from their own poses when none is given."""
         time = 1e-9 * (imu.stamp_ns - start_ns)
-        keep = np.concatenate([[True], np.diff(time) > 0])  # repeated stamps carry no new moment
+        keep = np.concatenate([[True], np.diff(time) > 0])  # repeated stamps add no new time
         imu, time = imu.select(keep), time[keep]
         period = float(np.median(np.diff(time)))
         made_here = calibration is None
@@ -65,10 +65,10 @@ class PairedImu:
 
 def clipped(values: np.ndarray) -> np.ndarray:
     """
-    Return which samples touch the end of the range, shape (n,).
+    Return which samples are at the end of the range, shape (n,).
 
-    The end of the range shows as the largest reading of one sign, over all axes, coming up again and again; a largest reading
-    that came twice or less is the motion's own. The two ends may differ by one count.
+    The end of the range is a largest reading of one sign, over all axes, that occurs repeatedly; a largest reading
+    that occurs at most twice is due to the motion. The two ends may differ by one count.
     """
     flagged = np.zeros(len(values), bool)
     for signed in (values, -values):
@@ -122,18 +122,18 @@ def window_centres(a: PairedImu, b: PairedImu, *, offset: float, length: float) 
 
 @dataclass(frozen=True, eq=False)
 class RelativeRotation:
-    """How B's axes and clock lie against A's."""
+    """Rotation and time offset of B relative to A."""
 
     mat_ab: np.ndarray
     """Rotation, B's frame to A's, shape (3, 3)."""
     cov: np.ndarray
     """Covariance of its error as a rotation vector, rad^2, shape (3, 3)."""
     offset: float
-    """How late B's stamps are, s."""
+    """Delay of B's stamps, s."""
 
 
 def relative_rotation(a: PairedImu, b: PairedImu, settings: ArmSettings, *, rounds: int = 4) -> RelativeRotation:
-    """Return the rotation from the directions at rest where both were calibrated, else from the rates; the offset from the rates."""
+    """Return the rotation from the directions at rest if both were calibrated, otherwise from the rates; the offset from the rates."""
     offset, length = 0.0, window_length(a, b, settings)
     for _ in range(rounds):
         centres = window_centres(a, b, offset=offset, length=length)

@@ -1,4 +1,4 @@
-"""What a recording by hand says of every effect: the search of a diagnosis, on poses and turns instead of windows on a table."""
+"""Test of every effect on a recording by hand: the search of a diagnosis, on poses and turns instead of windows on a table."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,15 +21,15 @@ from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort
 from imu_calibration.selection.search import Named, Search
 
 OUTER = 12
-"""Times that the whole search is repeated without some of the poses, to measure the gain on them."""
+"""Number of repetitions of the search without some of the poses, to measure the gain on them."""
 SPARE = 3
 """Least number of poses beyond the nine parameters of the accelerometer."""
 POSES_LEAST = 9 + SPARE
-"""Fewer poses leave none to hold out."""
+"""With fewer poses none can be held out."""
 
 
 class Inquiry:
-    """Rows of a recording, the evidence on some of its poses, and the search."""
+    """Rows of a recording, the evidence on a subset of its poses, and the search."""
 
     def __init__(self, blocks: Sequence[Block], space: HandSpace, questions: Sequence[Question], *, baseline: Sequence[int]):
         smooth = [k for q in questions if q.effect.smooth and not q.effect.time_constant for k in q.parameters]
@@ -47,9 +47,9 @@ class Inquiry:
 
     def named(self) -> list[Question]:
         """
-        Return the findings: chosen, and each explaining most of what was unexplained.
+        Return the findings: chosen effects of which each explains most of the excess variance.
 
-        Sizes that are known of no instrument come in only for what others leave.
+        Sizes beyond the range of known instruments are tested only for the remaining excess.
         """
         named = list(pruned(self.search.run(), self.share))
         if self.rest(named):
@@ -62,14 +62,14 @@ class Inquiry:
         return named
 
     def rest(self, chosen: Sequence[Question], sensor: str | None = None) -> float:
-        """Return what a choice leaves in excess of noise in held-out poses, where it is significant, of one sensor or of both."""
+        """Return the significant excess over noise of a choice in held-out poses, of one sensor or of both."""
         left = self.evidence.heldout_residuals(self.search.used(chosen))
         excess = [(np.sum(new**2 / block.floor) - new.size, new.size)
                   for block, new in zip(self.blocks, left) if sensor in (None, block.sensor)]
         return sum(value for value, size in excess if value > SIGNIFICANT_REST * np.sqrt(2 * size))
 
     def share(self, chosen: Sequence[Question], question: Question) -> float:
-        """Return the share of what noise does not explain in held-out poses that the effect removes from its sensor."""
+        """Return the share of the excess over noise in held-out poses that the effect removes from its sensor."""
         after, before = (self.evidence.heldout_residuals(self.search.used(c)) for c in (chosen, [q for q in chosen if q is not question]))
         removed = sum(np.sum((old**2 - new**2) / block.floor)
                       for block, new, old in zip(self.blocks, after, before) if block.sensor == question.sensor)
@@ -77,15 +77,15 @@ class Inquiry:
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """
-        Return whether the poses before and after the middle show an effect alike (`halves.agree`).
+        Return whether the estimates of an effect from the poses before and after the middle agree (`halves.agree`).
 
-        Smooth in time they differ by nature.
+        Effects that are smooth in time differ by nature.
         """
         if question.effect.smooth:
             return True
         used = self.search.used(chosen)
         poses = np.unique(np.concatenate([block.pose for block in self.blocks]))
-        # what the choice explains is no noise here, so that it is part of the baseline
+        # the chosen effects are no noise here, so they are part of the baseline
         first, second, whole = (HandEvidence(self._blocks_without(out), self.space, (), baseline=used).fit(used)
                                 for out in (*np.array_split(poses, 2), ()))
         return agree((first, second), whole, [used.index(k) for k in question.parameters])
@@ -93,35 +93,35 @@ class Inquiry:
 
 @dataclass(frozen=True, eq=False)
 class HandInvestigation(Named):
-    """What a search found, before it is put into words."""
+    """Result of a search, before its report."""
 
     baseline: HandCalibration
-    """The calibration that was asked what it lacks."""
+    """The calibration under diagnosis."""
     inquiry: Inquiry
     """Rows, evidence and search."""
     named: Sequence[Question]
     """Questions that became findings, in the order found."""
     held_out: Sequence
-    """(poses, what was named without them, the inquiry without them), ...: the whole search, repeated."""
+    """(poses, findings without them, the inquiry without them), ...: the complete search, repeated."""
     not_testable: list[dict]
-    """Effects that could not be asked about."""
+    """Effects that could not be tested."""
     constants: np.ndarray
-    """Time constants at which warm-ups were asked about, s."""
+    """Time constants of the warm-ups under test, s."""
     denied: Sequence[Question] = field(default_factory=list)
-    """Questions that would have become findings, but the halves of the recording disagree on them."""
+    """Effects that were rejected because the estimates of the two halves differ significantly."""
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
-        """Sensor -> effects that belong into the model."""
+        """Sensor -> effects for the model."""
         return {sensor: tuple(q.name for q in self.adopted if q.sensor == sensor) for sensor in SENSORS}
 
     @property
     def search(self) -> Search:
-        """On which they were chosen."""
+        """Search of the findings."""
         return self.inquiry.search
 
     def point(self) -> dict[str, np.ndarray]:
-        """Return effect -> values at which its columns are first taken, of the warm-ups that became findings."""
+        """Return effect -> initial values for its columns, of the warm-ups among the findings."""
         used = self.inquiry.search.used(self.named)
         values, point = self.inquiry.evidence.fit(used)[0], {}
         for question in self.named:
@@ -131,7 +131,7 @@ class HandInvestigation(Named):
         return point
 
     def moved_by(self, question: Question) -> dict[str, float]:
-        """Return parameter -> by how much an effect moves it, of the baseline, when it joins the findings."""
+        """Return baseline parameter -> its change when an effect is added to the findings."""
         search, evidence = self.inquiry.search, self.inquiry.evidence
         others = [q for q in self.named if q is not question]
         smaller, larger = search.used(others), search.used([*others, question])
@@ -140,26 +140,26 @@ class HandInvestigation(Named):
         return {names[k]: float(change) for k, change in zip(smaller, moved) if k < len(names)}
 
     def gain(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Gain:
-        """Return the Gain of one choice over another on poses that took part neither in the fit nor in the choice."""
+        """Return the Gain of one choice over another on poses held out from both fit and choice."""
         return _gain(self.inquiry, self.held_out, before, after, sensor)
 
 
 def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), progress: Callable | None = None) -> HandInvestigation:
     """
-    Ask every effect that can be seen by hand on poses that are held out.
+    Test every effect that is observable by hand on held-out poses.
 
-    Every pose is held out in turn. The accelerometer is judged by the norm of gravity, the gyroscope by the rates at rest and by the
-    directions of gravity before and after each turn. Poses are few, so that variances are estimated along (F tests, losses
-    ``n log(mean square)``), with a bias process beside the scatter from pose to pose.
+    Every pose is held out in turn. The accelerometer is tested with the norm of gravity, the gyroscope with the rates at rest and the
+    directions of gravity before and after each turn. Poses are few, so variances are estimated too (F tests, losses
+    ``n log(mean square)``), with a bias process in addition to the scatter between poses.
 
     Parameters
     ----------
     data : HandData
         From `gather_by_hand`.
     options : HandOptions
-        Reference, tolerances, and the effects of the baseline: bias and matrix where none are asked for.
+        Reference, tolerances, and the effects of the baseline: by default bias and matrix.
     progress : callable, optional
-        Called with the share that is done.
+        Called with the completed share.
 
     Raises
     ------
@@ -176,7 +176,7 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), pr
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
     report(0.1)
-    base = tuple(range(baseline.model.size + 1))   # held ones too, and the Earth: what they may be is no finding
+    base = tuple(range(baseline.model.size + 1))   # including fixed parameters and the Earth's rate: their uncertainty is no finding
     questions = _questions(effects, blocks, space, base, not_testable)
     inquiry = Inquiry(blocks, space, questions, baseline=base)
     named = inquiry.named()
@@ -197,7 +197,7 @@ def too_few_poses(count: int) -> NotObservableError:
 
 
 def _that_predict(inquiry, held_out, named):
-    """Return the findings that predict poses which had no part in choosing them."""
+    """Return the findings that improve the prediction of poses held out from their choice."""
     named = list(named)
     while named:
         gains = [_gain(inquiry, held_out, named[:k], named[:k + 1], q.sensor) for k, q in enumerate(named)]
@@ -222,7 +222,7 @@ def _why_not(effect, poses, turns, follows_gravity):
     if 'temperature' in effect.needs and np.ptp(poses.temperature_c) < TEMPERATURE_SPAN:
         return (f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only',
                 'record while the sensor warms up by at least some kelvins')
-    if effect.role is Role.CROSS and not follows_gravity:   # the question that calibration asks, with the same answer
+    if effect.role is Role.CROSS and not follows_gravity:   # the same test as in calibration
         return ('rates at rest do not separate it from a bias that moves in time', 'hold each attitude again later, in a different order')
     moving = effect.sensor == 'gyroscope' and any('rate' in group.uses for group in effect.groups)
     if moving and len([t for t in turns if t.rotation is None]) < 6:
@@ -231,7 +231,7 @@ def _why_not(effect, poses, turns, follows_gravity):
 
 
 def _questions(effects, blocks, space, base, not_testable):
-    """Return the questions; an effect that the baseline imitates in these poses is moved to those not testable."""
+    """Return the questions; an effect that is collinear with the baseline in these poses is moved to `not_testable`."""
     by_name, asked = {e.name: e for e in effects}, []
     probe = HandEvidence(blocks, space, (), baseline=base)
     for label in space.names:
@@ -248,7 +248,7 @@ def _questions(effects, blocks, space, base, not_testable):
 
 
 def _held_out(inquiry, report):
-    """Return fold -> (poses, what was named without them, evidence without them): the whole search, repeated."""
+    """Return fold -> (poses, findings without them, evidence without them): the complete search, repeated."""
     poses = np.unique(np.concatenate([block.pose for block in inquiry.blocks]))
     found, times = [], min(OUTER, len(poses))
     for number in range(times):
@@ -260,7 +260,7 @@ def _held_out(inquiry, report):
 
 
 def _predicted(inquiry, held_out, allowed):
-    """Return residuals per block of poses that had no part in the fit nor in the choice; only effects called `allowed` are used."""
+    """Return residuals per block of poses held out from fit and choice; only effects called `allowed` are used."""
     found = [np.full(block.known.shape, np.nan) for block in inquiry.blocks]
     for out, named, smaller in held_out:
         chosen = [q for q in named if q.name in allowed]
@@ -273,7 +273,7 @@ def _predicted(inquiry, held_out, allowed):
 
 
 def _gain(inquiry, held_out, before, after, sensor):
-    """Return the Gain of one choice over another on poses that took part neither in the fit nor in the choice."""
+    """Return the Gain of one choice over another on poses held out from both fit and choice."""
     pair = [_predicted(inquiry, held_out, {q.name for q in choice}) for choice in (before, after)]
     inside = [inquiry.evidence.heldout_residuals(inquiry.search.used(choice)) for choice in (before, after)]
     best = None

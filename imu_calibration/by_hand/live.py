@@ -1,4 +1,4 @@
-"""Calibration by hand while the IMU is being turned: poses are counted, what is missing is named, the answer is that of the recording."""
+"""Live calibration by hand: poses are counted, the missing motion is reported, and the result equals that of the recording."""
 
 import copy
 import time
@@ -31,38 +31,38 @@ from imu_calibration.segmentation.stream_cleaning import StreamCheck
 from imu_calibration.segmentation.window_settings import WindowSettings
 
 SEARCH_SHARE = 0.05
-"""Share of the time that looking for rest takes at most: after an hour at 200 Hz it is looked for every ten seconds or so."""
+"""Largest share of time for the search for rest: after an hour at 200 Hz a search runs every ten seconds or so."""
 SEARCH_STEP = 0.5
-"""Rest is looked for after so many seconds of new samples, at the earliest."""
+"""Least duration of new samples between searches for rest, s."""
 _FIRST_NEEDS = {'accelerometer': f'hold it still in {POSES_FULL} different attitudes',
                 'gyroscope': 'turn it from one attitude to the next, within half a minute'}
 MOST_POSES = 200
-"""The time of the joint estimate grows with the third power of their number; the oldest are forgotten."""
+"""The computation time grows with the third power of the number of poses; the oldest are discarded."""
 
 
 class LiveByHand:
     """
-    One session without a table as it happens: `push` what arrives, `solve` when it is due.
+    One live session without a table: `push` arriving samples, `solve` when due.
 
-    The samples are cleaned, searched and solved by the functions that read recordings, and they are all kept while they fit: the answer
-    is that of `workflow.calibrate_without_table` on the same samples. When they no longer fit (`hand_samples`) it is the answer to the
-    samples that are left. A clock that is set anew, which a recording is refused for, is taken as a pause.
+    The samples are cleaned, searched and solved by the functions for recordings, and all are kept up to the memory limit: the result
+    equals `workflow.calibrate_without_table` on the same samples. Beyond the limit (`hand_samples`) it is the result for the
+    kept samples. A clock reset, for which a recording is refused, is treated as a pause.
 
     Parameters
     ----------
     options : CalibrationOptions
-        What to estimate.
+        Requested model and reference.
     settings : LiveSettings
     by_hand : LiveByHandSettings
     saved : bytes, optional
-        What `saved` of an earlier run returned.
+        Return value of `saved` in an earlier run.
     clock : callable
-        Seconds of a steady clock.
+        Seconds of a monotonic clock.
 
     Raises
     ------
     InputError
-        When an effect is asked for that needs a table, or temperatures.
+        When a requested effect needs a table, or temperatures.
 
     """
 
@@ -82,7 +82,7 @@ class LiveByHand:
 
     @property
     def model(self) -> SensorModel:
-        """The model, as far as it is known before a solution."""
+        """The model, as far as known before a solution."""
         asked = self._asked
         return SensorModel(asked.accelerometer or BASE, asked.gyroscope or BASE, catalogue=asked.catalogue)
 
@@ -97,7 +97,7 @@ class LiveByHand:
         return '' if imu is None else imu.frame_id
 
     def change_windows(self, windows: WindowSettings) -> None:
-        """Find poses by other settings from now on, in all samples."""
+        """Use other settings for the poses from now on, in all samples."""
         self.options = replace(self.options, windows=windows)
         self._search(self._store)
 
@@ -113,19 +113,19 @@ class LiveByHand:
 
     @property
     def stamping(self) -> StampLine | None:
-        """How the stamps of the IMU are (`stamping.StampLine`); None while that is not known."""
+        """Regularity of the IMU stamps (`stamping.StampLine`); None while unknown."""
         return self._check.line
 
     @property
     def counts(self) -> dict[str, int]:
-        """Samples that could not be used, by reason."""
+        """Unusable samples, by reason."""
         counts = dict(self._drops)
         for reason, count in self._check.counts.items():
             counts[f'imu {reason}'] = counts.get(f'imu {reason}', 0) + count
         return {reason: count for reason, count in counts.items() if count}
 
     def push(self, block: SampleBlock) -> list[ImuSamples]:
-        """Take what arrived and return the poses that are over and were not returned before, as mean ImuSamples, one each, in a list."""
+        """Add arriving samples; return the poses completed since the last call, as mean ImuSamples, one each, in a list."""
         for reason, count in (block.dropped or {}).items():
             self._drops[reason] = self._drops.get(reason, 0) + count
         imu = block.imu
@@ -161,12 +161,12 @@ class LiveByHand:
 
     def solve(self, pending: bool = False, provenance: dict | None = None) -> HandResult:
         """
-        Solve what was gathered and return the HandResult, which stays in `result`.
+        Solve the collected samples and return the HandResult, also stored in `result`.
 
         Parameters
         ----------
         pending : bool
-            Count the last sample in, which may yet turn out to be a stray; the rest that goes on counts in any case.
+            Include the last sample, which may prove to be a stray; the current rest is included in any case.
         provenance : dict, optional
             For the document.
 
@@ -205,8 +205,8 @@ class LiveByHand:
         """
         Return measured minus predicted of poses from `push`, as ImuSamples, or None before the first solution.
 
-        The direction of gravity in a pose is estimated, so that of the specific force only the length can differ from what is
-        predicted; the rate is compared with zero.
+        The direction of gravity in a pose is estimated, so only the length of the specific force can differ from its
+        prediction; the rate is compared with zero.
         """
         if self.result is None or not poses:
             return None
@@ -223,21 +223,21 @@ class LiveByHand:
         return group_states(self.result)
 
     def coverage(self) -> Coverage:
-        """Return the Coverage: which attitudes are worth having, where to go next."""
+        """Return the Coverage: useful attitudes, and the next one."""
         known = (self.found, self.result, self.options.gravity)
         if self._shown is None or any(a is not b for a, b in zip(known, self._shown[0], strict=True)):
             self._shown = known, hand_coverage(self.found, self.result, hand_options(self.options), frame_id=self.frame_id)
         return self._shown[1]
 
     def status(self, hints: dict[str, str] | None = None) -> SessionStatus:
-        """Return the SessionStatus: what there is, and the pose or turn that helps most; `hints` as for `errors.with_hint`."""
+        """Return the SessionStatus: progress, and the pose or turn with the largest gain; `hints` as for `errors.with_hint`."""
         status = hand_status(self.found, self.result.calibration if self.result else None, gravity_unknown=self.options.gravity is None,
                              step=self.coverage().next.text, hints=hints)
         return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
 
 
 def _check_model(model):
-    """Refuse effects that need a table, and those of temperature: live, no temperatures are kept with the poses."""
+    """Refuse effects that need a table, and effects of temperature: a live session stores no temperatures with the poses."""
     thermal = [effect.name for effect in model.effects if 'temperature' in effect.needs]
     if thermal:
         raise InputError(f"{', '.join(thermal)} must be estimated by hand from a recording, live no temperatures are kept; "

@@ -1,4 +1,4 @@
-"""The parameters of a calibration by hand: bias and matrix of both sensors, and further effects straight from the catalogue."""
+"""The parameters of a calibration by hand: bias and matrix of both sensors, and further effects of the catalogue."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,23 +13,23 @@ from imu_calibration.errors import InputError
 from imu_calibration.reference.reference_motion import Reference
 
 LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
-"""Entries of the accelerometer matrix that the gauge leaves free."""
+"""Free entries of the accelerometer matrix under the gauge."""
 FIXED = tuple(linear_names('accelerometer')[np.triu_indices(3, 1)].tolist())
 """Zero by the choice of axes."""
 BASE_NAMES = tuple(name for name in SensorModel().param_names if name not in FIXED)
-"""Parameters that every calibration by hand has, in their order."""
+"""Parameters of every calibration by hand, in their order."""
 N_BASE = len(BASE_NAMES)
 ACCELEROMETER, GYRO_BIAS, GYRO_MATRIX = slice(0, 9), slice(9, 12), slice(12, 21)
 BASE_NOMINAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1], float)
 """Zero bias, identity matrices."""
 UNKNOWN_BY_HAND = {'angular acceleration', 'attitude', 'joint angle', 'joint rate'}
-"""Quantities that gravity in poses and the rates between them do not tell."""
+"""Quantities that cannot be determined from gravity in poses and the rates between them."""
 REPEATS = 4
-"""Fixed-point steps that invert an effect: each gains a factor of its size against the input, a thousand or more."""
+"""Fixed-point steps that invert an effect: each reduces the error by its size relative to the input, a thousand or more."""
 
 
 def possible_by_hand(effect: Effect) -> bool:
-    """Return whether gravity in poses and the turns between them can show an effect: it has columns, and none of them asks for a table."""
+    """Return whether an effect is observable from gravity in poses and the turns between them: it has columns, and none needs a table."""
     return bool(effect.groups) and effect.warp is None and not any(group.uses & UNKNOWN_BY_HAND for group in effect.groups)
 
 
@@ -44,7 +44,7 @@ def unpack(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
 @dataclass(frozen=True, eq=False)
 class HandModel:
     """
-    A SensorModel without table: `BASE_NAMES`, then the further effects of the accelerometer, then those of the gyroscope.
+    A SensorModel without table: `BASE_NAMES`, then the further effects of the accelerometer, then the gyroscope's.
 
     Raises
     ------
@@ -58,10 +58,10 @@ class HandModel:
     gravity: float
     """Reference, m/s^2."""
     gyro_factor: float = 1.0
-    """Nominal reading of the gyroscope over the true rate: 2 where the driver converts for half the full-scale range that is set."""
+    """Nominal reading of the gyroscope over the true rate: 2 where the driver converts for half the actual full-scale range."""
 
     def __post_init__(self):
-        """Refuse what cannot be seen by hand."""
+        """Refuse effects that are not observable by hand."""
         strange = [e.name for e in self.model.further if not possible_by_hand(e)]
         if strange:
             raise InputError('the reference by hand is gravity and the turns between poses, '
@@ -105,7 +105,7 @@ class HandModel:
         return sd
 
     def tolerances(self, given: dict) -> np.ndarray:
-        """Return the standard deviations that are good enough, shape (n,); the catalogue's where `given` has none."""
+        """Return the sufficient standard deviations, shape (n,); the catalogue's where `given` has none."""
         known = dict(zip(self.model.param_names, tolerances_of(self.model, given)))
         return np.array([known[name] for name in self.param_names])
 
@@ -119,7 +119,7 @@ class HandModel:
         return self.index_of(sensor)[9 if sensor == 'accelerometer' else 12:]
 
     def at(self, values: np.ndarray) -> 'HandModel':
-        """Return the same model with the columns of warm-ups taken at `values`."""
+        """Return the same model with the columns of warm-ups computed at `values`."""
         return replace(self, model=self.model.at(self.in_model_order(values)))
 
     def in_model_order(self, values: np.ndarray) -> np.ndarray:
@@ -130,7 +130,7 @@ class HandModel:
     def further(self, sensor: str, values: np.ndarray, force: np.ndarray, *, rate: np.ndarray, time: np.ndarray | None = None,
                 temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return what the further effects add to the output of a sensor, and its derivative by their parameters.
+        Return the contribution of the further effects to the output of a sensor, and its derivative by their parameters.
 
         Parameters
         ----------

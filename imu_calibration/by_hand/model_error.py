@@ -13,10 +13,10 @@ from imu_calibration.estimation.variance_components import GroupVariances
 def hand_model_error(model: HandModel, state: State, poses: Poses, *, turns: list[TurnData], scatter: GroupVariances,
                      free: np.ndarray) -> ModelError:
     """
-    Return by how much parts of a recording by hand ask for different parameters than noise and scatter explain.
+    Return the model error from the scatter of parameters between parts of a recording by hand, beyond noise and known scatter.
 
-    A block is a pose with the turn that begins in it. Directions of gravity and drifts of the bias are estimated along, so that what noise
-    allows the parts' sums is that of rows from which these, and the parameters, have been fitted.
+    A block is a pose with the turn that begins in it. Directions of gravity and drifts of the bias are estimated too, so that the expected
+    covariance of the shifts is the one of rows from which these, and the parameters, have been fitted.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Weighted integrals over short windows: derivatives without differentiating, for stamps that need not be even."""
+"""Weighted integrals over short windows: derivatives without differentiation, also for uneven stamps."""
 
 from dataclasses import dataclass
 
@@ -7,10 +7,10 @@ import numpy as np
 POWER = 6
 """The weight is sin^6: with eight samples per window its sums equal its integrals, and its ends are smooth to fifth order."""
 SAMPLES_LEAST = 8
-"""Samples per window; with fewer the sums feel where the samples lie."""
+"""Samples per window; with fewer the sums depend on the positions of the samples."""
 
 BLOCK = 4_000_000
-"""Numbers gathered at once."""
+"""Numbers per gather operation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,8 +19,8 @@ class Windows:
     Windows of one length over one stream.
 
     For a signal x and the weight phi of a window (zero at its ends, integral 1): ``mean = int phi x dt`` and, by parts,
-    ``slope = int phi dx/dt dt = -int (dphi/dt) x dt``. Both see the same low-pass, so that an equation between x, its
-    derivative and other signals holds for its weighted integrals too, whatever the motion between the samples does.
+    ``slope = int phi dx/dt dt = -int (dphi/dt) x dt``. Both apply the same low-pass, so an equation between x, its
+    derivative and other signals also holds for its weighted integrals, for any motion between the samples.
     """
 
     index: np.ndarray
@@ -39,7 +39,7 @@ class Windows:
         return _weighted(self.index, self.weight_slope, values)
 
     def touches(self, flags: np.ndarray) -> np.ndarray:
-        """Return which windows hold a flagged sample, shape (n_windows,)."""
+        """Return which windows contain a flagged sample, shape (n_windows,)."""
         return np.any(flags[self.index] & (self.weight > 0), axis=1)
 
     def select(self, keep: np.ndarray) -> 'Windows':

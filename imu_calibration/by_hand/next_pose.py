@@ -1,4 +1,4 @@
-"""By hand: what is known of a session, which attitude comes next, and how long it will take until everything is determined."""
+"""Next attitude of a session by hand: current knowledge, next step, and time until all parameters are determined."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 
 
 def knowledge_of(found: Findings, result: HandResult | None, options: HandOptions) -> HandKnowledge:
-    """Return the HandKnowledge of a session: before the first solution from its poses alone, after it that of the solution."""
+    """Return the HandKnowledge of a session: before the first solution from its poses, then from the solution."""
     if result is not None:
         return knowledge_after(result.hand)
     model = HandModel(SensorModel(options.accelerometer or BASE, options.gyroscope or BASE, catalogue=options.catalogue), options.gravity)
@@ -24,7 +24,7 @@ def knowledge_of(found: Findings, result: HandResult | None, options: HandOption
 
 
 def hand_coverage(found: Findings, result: HandResult | None, options: HandOptions, *, frame_id: str = '') -> Coverage:
-    """Return the Coverage of a session by hand: the cells, the next pose with the turn that leads to it, and the seconds that are left."""
+    """Return the Coverage of a session by hand: the cells, the next pose with the turn to it, and the remaining seconds."""
     seen = ups_of(found.poses)
     up = None if found.poses is None else seen[-1]
     knowledge = knowledge_of(found, result, options)

@@ -1,4 +1,4 @@
-"""What a calibration by hand estimates, from which reference, and its numbers."""
+"""Options of a calibration by hand: effects, reference, settings."""
 
 from dataclasses import dataclass, field
 
@@ -37,7 +37,7 @@ class ByHandSettings:
 
 @dataclass(frozen=True)
 class KnownTurn:
-    """A turn of known angle about a body axis that stays put."""
+    """A turn of known angle about a fixed body axis."""
 
     start: int
     """First sample."""
@@ -51,7 +51,7 @@ class KnownTurn:
 
 @dataclass(frozen=True)
 class HandOptions:
-    """What is handed down from the use cases to the equations."""
+    """Options passed from the use cases to the equations."""
 
     gravity: float = STANDARD_GRAVITY
     """Local gravity, m/s^2."""
@@ -60,23 +60,23 @@ class HandOptions:
     settings: ByHandSettings = ByHandSettings()
     """Numbers."""
     tolerances: dict = field(default_factory=dict)
-    """{sensor: {effect: sd that is good enough}}; the catalogue's where not given."""
+    """{sensor: {effect: sufficient sd}}; by default the catalogue's."""
     accelerometer: tuple[str, ...] | None = None
     """Effects to estimate; None: bias and matrix."""
     gyroscope: tuple[str, ...] | None = None
-    """The same; None: bias and matrix, and the g-sensitivity when the settings and the poses say so."""
+    """The same; None: bias and matrix, and the g-sensitivity according to the settings and the poses."""
     catalogue: Catalogue = CATALOGUE
-    """Where the effects are declared."""
+    """Declarations of the effects."""
 
 
 def hand_options(options: CalibrationOptions) -> HandOptions:
     """
-    Return what is asked for, by hand: the standard gravity with what it may be off by where the local one is not known.
+    Return the requested options by hand: the standard gravity with its uncertainty if the local one is unknown.
 
     Raises
     ------
     InputError
-        When an effect does not exist, gravity is impossible, or something is requested that needs a table.
+        When an effect does not exist, gravity is impossible, or a requested option needs a table.
 
     """
     if options.noise is not None:

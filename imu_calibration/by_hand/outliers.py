@@ -1,4 +1,4 @@
-"""Poses and turns that do not belong to the others: somebody touched the IMU, or the recorder missed a turn."""
+"""Outlying poses and turns: a touch of the IMU, or a turn that the recorder missed."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,23 +12,23 @@ from imu_calibration.by_hand.solver import HandSolution
 from imu_calibration.estimation.f_test import chance_of_fall
 
 P_VALUE = 1e-3
-"""Chance that a recording without outliers loses a pose or turn, per kind."""
+"""False positive rate for a recording without outliers, per kind."""
 SHARE = 0.1
-"""Of each kind, at most this share is left out (one of few): what is more frequent is how the recording is."""
+"""Largest share of each kind that is excluded (one of few); a more frequent deviation is a property of the recording."""
 LEAST_SPARE = 3.0
-"""Degrees of freedom that the others must leave to judge by."""
+"""Degrees of freedom of the remaining data that the test requires."""
 CONTRADICTED = 0.35
 """
-rad; gravity after a turn that is so far from where the rates carry it is not the rates' doing: scales that are off by a tenth leave less.
+rad; a larger angle between rotated and observed gravity after a turn is no error of the rates: scale errors of a tenth cause less.
 """
 SEEN = 0.05
-"""A combination of a unit's rows that keeps less than this share of its error after the fit says nothing."""
+"""A combination of a unit's rows that keeps less than this share of its error after the fit is not tested."""
 LOOSE = 1e3
-"""Factor on the noise of a pose's mean that takes its say, and leaves its direction to the turns."""
+"""Sd factor that excludes an outlying pose; its direction is still estimated from the turns."""
 
 
 def possible_turns(model: HandModel, state: State, poses: Poses, *, turns: Sequence[TurnData]) -> tuple[list[TurnData], int]:
-    """Return (turns that carry gravity to about where it is found, number of the others): where a recorder paused, rates miss the turn."""
+    """Return (turns whose rates match gravity approximately, number of excluded turns): in a pause of the recorder, rates miss a turn."""
     kept = [turn for turn in turns if turn.rotation is not None
             or missed_angle(state, poses, turn, matrix=model.gyro_factor * np.eye(3)) < CONTRADICTED]
     return kept, len(turns) - len(kept)
@@ -36,9 +36,9 @@ def possible_turns(model: HandModel, state: State, poses: Poses, *, turns: Seque
 
 def without_outliers(model: HandModel, found: HandSolution, *, poses: Poses, turns: list[TurnData]) -> tuple[Poses, list[TurnData], dict]:
     """
-    Return (poses, turns, {kind: number}) without what is improbable beside its kind: F tests of leaving one out, for as many as there are.
+    Return (poses, turns, {kind: number}) without outliers: leave-one-out F tests per kind, with Bonferroni correction.
 
-    Poses that are left out stay in their place, with means that count for nothing.
+    Excluded poses keep their place, with negligible weight.
     """
     units = _units(poses, turns)
     rest, leverage, component = _whitened(model, found, poses, turns)
@@ -73,7 +73,7 @@ def _units(poses, turns):
 
 
 def _whitened(model, found, poses, turns):
-    """Return residuals in sds, an orthonormal basis of what was fitted, and the component of each row."""
+    """Return residuals in sds, an orthonormal basis of the fitted columns, and the component of each row."""
     system = build_system(model, found.state, poses, turns=turns)
     root = np.sqrt(found.scatter.total(system.noise, system.component))
     design = np.hstack([system.nuisance, system.main[:, ~found.held]]) / root[:, None]
@@ -83,7 +83,7 @@ def _whitened(model, found, poses, turns):
 
 
 def _distance(rest, basis, least):
-    """Return (squared Mahalanobis distance of some residuals, whose covariance is what the fit left them, and its rank)."""
+    """Return (squared Mahalanobis distance of some residuals, with the covariance of residuals after the fit, and its rank)."""
     values, vectors = np.linalg.eigh(np.eye(len(rest)) - basis @ basis.T)
     seen = values > least
     return float(np.sum((vectors[:, seen].T @ rest)**2 / values[seen])), int(np.count_nonzero(seen))

@@ -1,4 +1,4 @@
-"""From samples to poses: means over the intervals held still, and what the noise within them leaves."""
+"""Poses from samples: means over the intervals held still, and their standard errors."""
 
 from typing import Sequence
 
@@ -10,7 +10,7 @@ from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.samples import ImuSamples, rounding_variance
 
 CREEPS = 3.0
-"""Mean square of the slopes of forces across gravity, over what noise gives them, from which on poses creep."""
+"""Mean square of the slopes of forces across gravity, relative to its expectation from noise, above which poses creep."""
 
 DITHER = 3.0
 """Variance of readings over that of rounding below which rounding is not averaged: half a step; 1 % of a step remains above."""
@@ -18,11 +18,11 @@ DITHER = 3.0
 
 def average_poses(imu: ImuSamples, ranges: Sequence[tuple[int, int]], temperature_c: np.ndarray | None = None) -> Poses:
     """
-    Return the means over the intervals, with the sd that the noise within them leaves.
+    Return the means over the intervals, with their sd from the noise within the intervals.
 
     `temperature_c` is that of the samples, shape (n,), when it was recorded.
 
-    The noise need not be white: means of pieces of half a second or more say by how much sums of samples scatter beyond it.
+    The noise need not be white: the scatter of means of pieces of half a second or more determines the factor over white noise.
     """
     parts = {'accelerometer': [imu.force_s[a:b] for a, b in ranges], 'gyroscope': [imu.rate_s[a:b] for a, b in ranges]}
     rounding = {'accelerometer': rounding_variance(imu.force_s), 'gyroscope': rounding_variance(imu.rate_s)}
@@ -47,7 +47,7 @@ def _with_rounding(variance, parts, rounding):
 
 def _creep(forces, length, noise):
     """
-    Return the rates at which the attitude creeps in each pose, as far as gravity shows them, rad/s, shape (k, 3).
+    Return the rates at which the attitude creeps in each pose, as observable from gravity, rad/s, shape (k, 3).
 
     ``d force / dt = -rate x force``: the part across gravity. Zero where the slopes of all poses together are no more than noise.
     """

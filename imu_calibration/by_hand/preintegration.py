@@ -48,7 +48,7 @@ def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndar
     bias, matrix : arrays, shape (3,) and (3, 3)
         Forward model ``measured = bias + matrix @ rate + further effects``.
     further : tuple, optional
-        What further effects add to the readings, shape (n, 3), and its derivative by their p parameters, shape (n, 3, p).
+        Contribution of further effects to the readings, shape (n, 3), and its derivative by their p parameters, shape (n, 3, p).
 
     Returns
     -------
@@ -80,13 +80,13 @@ def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndar
 
 
 def small_rotation(vector: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix of one rotation vector, to second order in what the caller keeps small."""
+    """Return the rotation matrix of one rotation vector, to second order in its small length."""
     cross = skew(vector)
     return np.eye(3) + cross + 0.5 * cross @ cross
 
 
 def _slope_weights(time):
-    """Return weights of the sample before, the sample itself and the one after in its slope, shape (3, n), 1/s; one-sided at the ends."""
+    """Return weights of the sample before, the sample and the one after in its slope, shape (3, n), 1/s; one-sided at the ends."""
     step = np.diff(time)
     before, after = step[:-1], step[1:]
     weights = np.zeros((3, len(time)))
@@ -97,7 +97,7 @@ def _slope_weights(time):
 
 
 def _per_sample(gain, step, first, second, slopes):
-    """Return H with ``psi = sum_m H_m @ delta rate_m``: each sample ends one step, begins the next, and bends its neighbours."""
+    """Return H with ``psi = sum_m H_m @ delta rate_m``: each sample ends one step, begins the next, and enters its neighbours' slopes."""
     half, square = 0.5 * step[:, None, None] * np.eye(3), MAGNUS_SECOND * (step**2)[:, None, None]
     weight = np.zeros((len(step) + 1, 3, 3))
     weight[:-1] += gain @ (half - square * skew(second))
@@ -133,7 +133,7 @@ def _prefix_product(quaternions):
 
 
 def _matrix_to_sensor(quaternions):
-    """Return the matrices that take coordinates in the first sensor frame to the turned one (the transposed attitude)."""
+    """Return the matrices that transform coordinates from the first sensor frame to the turned one (the transposed attitude)."""
     cross = skew(quaternions[1:].T)
     return np.eye(3) - 2 * quaternions[0, :, None, None] * cross + 2 * cross @ cross
 

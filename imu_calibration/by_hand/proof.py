@@ -1,4 +1,4 @@
-"""Does a calibration by hand help on poses and turns that took no part?"""
+"""Evaluation of a calibration by hand on held-out poses and turns."""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -20,31 +20,31 @@ from imu_calibration.effects.applied import applied_values
 from imu_calibration.estimation.scaled_solve import scaled_lstsq
 
 FOLDS = 8
-"""Parts that are left out in turn."""
+"""Number of held-out parts."""
 ATTITUDES_LEAST = 10
-"""So many attitudes must stay when a part is left out: nine parameters of the accelerometer take one equation each."""
+"""Fewest remaining attitudes when a part is held out: nine parameters of the accelerometer need one equation each."""
 FEW_ATTITUDES = 6
-"""So many must stay when one pose is left out: biases and scale factors of the accelerometer take one equation each."""
+"""Fewest remaining attitudes when one pose is held out: biases and scale factors of the accelerometer need one equation each."""
 TURNS_LEAST = 6
-"""So many turns must stay, and be left out altogether."""
+"""Fewest remaining turns, and fewest held-out turns in total."""
 PER_TURN = 'rad per turn'
-"""Unit of the angle by which gravity is carried past where it is found."""
+"""Unit of the angle between rotated and observed gravity."""
 
 
 def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: ByHandSettings) -> dict:
     """
     Return the proof of a calibration by hand: sensor -> entry of a document (see `calibration.proof`).
 
-    Every eighth pose, with few attitudes one pose, is left out with the turns that begin or end there: one step from the solution with
-    their rows left out. The error of the accelerometer is the length of its corrected reading in a pose less gravity; that of the
-    gyroscope the angle by which it carries gravity past the pose that a turn ends in. Readings are corrected as by compensation; with
-    effects in time the last third of the poses is judged. Too few poses or turns to leave any out: no entry.
+    Every eighth pose, with few attitudes one pose, is held out with the turns that begin or end there: one step from the solution without
+    their rows. The error of the accelerometer is the length of its corrected reading in a pose less gravity; that of the
+    gyroscope the angle between gravity rotated by its rates and gravity in the pose at the end of a turn. Readings are corrected as by
+    compensation; with effects in time the last third of the poses is evaluated. With too few poses or turns there is no entry.
 
     Parameters
     ----------
     hand : HandCalibration
     turns : sequence of TurnData
-        What it was estimated from beside its poses.
+        Turns of the estimate.
     settings : ByHandSettings
 
     """
@@ -68,7 +68,7 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
 
 
 def _folds(poses, settings):
-    """Return masks of the poses to leave out in turn: an eighth of them, or with few attitudes one pose; none with too few."""
+    """Return masks of the poses to hold out in turn: an eighth of them, or with few attitudes one pose; none with too few."""
     number = np.arange(len(poses.start))
     for count, least in ((FOLDS, ATTITUDES_LEAST), (len(number), FEW_ATTITUDES)):
         folds = [number % count == fold for fold in range(count)]
@@ -96,7 +96,7 @@ def _applied(model, values, centre):
 
 
 class _Rows:
-    """The weighed equations at the solution, each row with the poses that it belongs to."""
+    """The weighted equations at the solution, each row with its poses."""
 
     def __init__(self, hand, turns):
         model, count = hand.model, len(hand.poses.start)
@@ -134,14 +134,14 @@ def _selected(poses, mask):
 
 
 def _corrected(model, values, force, rate, temperature_c):
-    """Return readings as compensation corrects them with some parameters."""
+    """Return readings corrected as by compensation with some parameters."""
     own = model.in_model_order(values)
     known = Calibration(model.model.at(own), own, np.zeros((len(own),) * 2), (HELD,) * len(own))
     return compensate(known, force, rate, alpha_s=np.zeros_like(force), temperature_c=temperature_c)
 
 
 def _missed(model, values, poses, turns, gyroscope):
-    """Return the angles by which turns are missed, rad, with the accelerometer of `values` and the gyroscope of others."""
+    """Return the angle errors of turns, rad, with the accelerometer of `values` and the parameters `gyroscope` of the gyroscope."""
     mixed = values.copy()
     for part in (GYRO_BIAS, GYRO_MATRIX, model.extra_index('gyroscope')):
         mixed[part] = gyroscope[part]

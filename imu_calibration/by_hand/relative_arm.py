@@ -1,4 +1,4 @@
-"""Where one IMU sits relative to another on the same rigid body, from their readings in motion."""
+"""Position of one IMU relative to another on the same rigid body, from their readings in motion."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,17 +24,17 @@ from imu_calibration.reference.reference_motion import skew
 from imu_calibration.samples import ImuSamples
 
 NUISANCE = ('bias.x', 'bias.y', 'bias.z', 'force_offset', 'rate_delay')
-"""Differences of the accelerometers' biases and stamps, and the gyroscopes' lateness against the accelerometers."""
+"""Differences of the accelerometers' biases and stamps, and the gyroscopes' delay relative to the accelerometers."""
 ARM_PRIOR = 1.0
-"""m; an arm whose sd exceeds half of it counts as not seen."""
+"""m; an arm whose sd exceeds half of it is not observable."""
 ARM_TOLERANCE = 1e-3
-"""m; the sd that is good enough."""
+"""m; the sufficient sd."""
 UNCALIBRATED_SCALE_SD = 0.03
-"""Scale and misalignment of a consumer gyroscope that no poses calibrated."""
+"""Scale and misalignment of a consumer gyroscope without calibration from poses."""
 DELAY_ROUNDS = 5
-"""The delay shifts the windows of the rates until nothing is left of it."""
+"""Rounds in which the windows of the rates are shifted by the delay until the residual delay vanishes."""
 WINDOWS_LEAST = 40
-"""Fewer say little about eight numbers and their scatter."""
+"""With fewer windows eight parameters and their scatter are not determined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +48,11 @@ class RelativeArm:
     mat_ab: np.ndarray
     """Rotation, B's frame to A's, shape (3, 3)."""
     time_offset: float
-    """How late B's stamps are against A's, s."""
+    """Delay of B's stamps relative to A's, s."""
     statuses: tuple
     """'determined' (sd within 1 mm) or 'weak' for x, y, z."""
     diagnostics: dict
-    """Plain numbers: windows, clipped share, residuals, nuisances, what the calibration added to the sd."""
+    """Plain numbers: windows, clipped share, residuals, nuisances, contribution of the calibration to the sd."""
 
     @property
     def arm_sd(self) -> np.ndarray:
@@ -60,7 +60,7 @@ class RelativeArm:
         return np.sqrt(np.diag(self.covariance))
 
     def lines(self) -> Iterator[str]:
-        """Return the remarks for a person to read."""
+        """Return the remarks for the user."""
         d = self.diagnostics
         turn = np.degrees(Rotation.from_matrix(self.mat_ab).magnitude())
         yield f'B is turned by {turn:.2f} deg against A; its stamps are {1e3 * self.time_offset:+.2f} ms late'
@@ -80,7 +80,7 @@ def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples, settings: ArmSettings = A
     Estimate the arm r of ``f_B - f_A = alpha x r + omega x (omega x r)`` between two IMUs on one rigid body.
 
     Both sides are integrated over short windows with the same smooth weight; alpha enters as minus the integral of the
-    weight's derivative times the rate, so nothing is differentiated. Windows with clipped samples are left out. Biases,
+    weight's derivative times the rate, so no signal is differentiated. Windows with clipped samples are excluded. Biases,
     scales and axes come from a calibration by hand of each IMU, made from the poses in the same recording when not given.
 
     Parameters
@@ -101,7 +101,7 @@ def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples, settings: ArmSettings = A
     InputError
         When the recordings do not overlap.
     NotObservableError
-        When the motion does not show the arm; the message names the component.
+        When the motion does not determine the arm; the message names the component.
 
     """
     require_overlap(imu_a, imu_b)
@@ -137,7 +137,7 @@ def _build_rows(a, b, rotation, delay, settings):
                                  'twist both IMUs together about all axes for 20 s or more, below the range of the gyroscopes')
     lag = 0.1 * (centres[1] - centres[0])  # the second derivative, for the small delay column only
     later, sooner = (make_windows(a.time, centres[keep] + delay + s * lag, length).slope(a.rate) for s in (1, -1))
-    # half of the difference of two gyroscopes is the error of their mean, as far as they err independently
+    # half of the difference of two gyroscopes is the error of their mean, if their errors are independent
     noise = np.mean((alpha_b - alpha_a)[keep]**2) / 4
     force = force_b.select(keep).mean(b.force @ rotation.mat_ab.T)
     return ArmRows(centres[keep], force - force_a.select(keep).mean(a.force), 0.5 * (alpha_a + alpha_b)[keep], products[keep],
@@ -151,13 +151,13 @@ def _products(integrate, rate):
 
 
 def _rotation_covariance(fit, rows, rotation):
-    """What the uncertainty of the rotation between the IMUs adds."""
+    """Contribution of the uncertainty of the rotation between the IMUs."""
     shift = response(fit, -skew(rows.force))
     return (shift @ rotation.cov @ shift.T)[:3, :3]
 
 
 def _calibration_covariance(fit, rows, a, b):
-    """What the uncertainty of the gyroscopes' matrices adds: ``rate -> (1 - E) rate`` with the sd of E."""
+    """Contribution of the uncertainty of the gyroscopes' matrices: ``rate -> (1 - E) rate`` with the sd of E."""
     columns = []
     for p in range(3):
         for q in range(3):
@@ -196,7 +196,7 @@ def _result(rows, fit, delay, rotation, streams, settings):
 
 
 def _require_seen(seen, sd):
-    """Refuse when some direction of the arm shows in the gyroscopes' noise only, or hardly at all."""
+    """Refuse when the signal of a direction of the arm is the gyroscopes' noise, or hardly above it."""
     shares, directions = seen
     direction = directions[:, np.argmin(shares)]
     worst = int(np.argmax(np.abs(direction))) if shares.min() < 0.5 else int(np.argmax(np.where(np.isfinite(sd), sd, np.inf)))

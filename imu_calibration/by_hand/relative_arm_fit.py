@@ -1,4 +1,4 @@
-"""The equation of the relative arm over many windows, solved robustly: long tails, noisy columns, honest spread."""
+"""The equation of the relative arm over many windows: robust fit with Student-t errors and noisy columns, with its covariance."""
 
 from dataclasses import dataclass, replace
 
@@ -9,12 +9,12 @@ from imu_calibration.errors import NotObservableError
 from imu_calibration.reference.reference_motion import skew
 
 TAIL_DOF = 3
-"""Student's t of the residuals: knocks make long tails."""
+"""Degrees of freedom of Student's t of the residuals: knocks cause long tails."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArmRows:
-    """Integrated equations of the windows that show the arm."""
+    """Integrated equations of the windows with information about the arm."""
 
     centres: np.ndarray
     """Middles of the windows, s, shape (n,)."""
@@ -50,7 +50,7 @@ class Fit:
     """Robust solution of the rows."""
 
     values: np.ndarray
-    """Arm, difference of biases, lateness of B's force, remaining delay of the rates, shape (8,)."""
+    """Arm, difference of biases, delay of B's force, remaining delay of the rates, shape (8,)."""
     design: np.ndarray
     """Columns, shape (n, 3, 8)."""
     residual: np.ndarray
@@ -58,11 +58,11 @@ class Fit:
     weights: np.ndarray
     """Weight of each window, shape (n,)."""
     weight_fall: np.ndarray
-    """How fast each weight falls with the square of its residual, shape (n,)."""
+    """Derivative of each weight by the square of its residual, negated, shape (n,)."""
     hessian: np.ndarray
     """Derivative of the estimating equations by the values, shape (8, 8)."""
     seen: tuple
-    """Shares of the arm's information that are not noise of the columns, with their directions."""
+    """Signal shares of the arm's information without the noise of the columns, with their directions."""
 
     def weighted(self, index: np.ndarray | slice) -> np.ndarray:
         """Return design' times the derivative of the weighted residual by the residual, for some windows, shape (n, p, 3)."""
@@ -71,14 +71,14 @@ class Fit:
         return turned * self.weights[index, None, None] - along[:, :, None] * residual[:, None, :]
 
     def curvature(self, index: np.ndarray | slice) -> np.ndarray:
-        """Return what some windows add to the Hessian, shape (p, p)."""
+        """Return the contribution of some windows to the Hessian, shape (p, p)."""
         rows = np.swapaxes(self.weighted(index), 1, 2).reshape(-1, self.design.shape[2])
         return rows.T @ self.design[index].reshape(rows.shape)
 
 
 def fit_arm(rows: ArmRows) -> Fit:
     """
-    Solve ``difference = W(alpha, rate) @ arm + bias + lateness and delay terms`` with Student-t errors.
+    Solve ``difference = W(alpha, rate) @ arm + bias + delay terms`` with Student-t errors.
 
     Parameters
     ----------
@@ -114,12 +114,12 @@ def fit_arm(rows: ArmRows) -> Fit:
 
 
 def _reduced(normal):
-    """Return the normal matrix of the arm with everything else eliminated."""
+    """Return the normal matrix of the arm after elimination of the other parameters."""
     return normal[:3, :3] - normal[:3, 3:] @ np.linalg.solve(normal[3:, 3:], normal[3:, :3])
 
 
 def _normal(design, weights, excess):
-    """Weighted normal matrix, less what the noise of the angular acceleration adds to it (errors in variables)."""
+    """Weighted normal matrix, less the contribution of the noise of the angular acceleration (errors in variables)."""
     flat = (design * np.sqrt(weights)[:, None, None]).reshape(-1, design.shape[2])
     normal = flat.T @ flat
     ridge = 1e-12 * np.maximum(np.diag(normal), 1e-12)
@@ -129,10 +129,10 @@ def _normal(design, weights, excess):
 
 def _robust_fit(design, target, alpha_noise):
     """
-    Student-t regression by reweighting; returns (values, weights, how the weights fall, excess of the normal matrix).
+    Student-t regression by reweighting; returns (values, weights, negated derivative of the weights, excess of the normal matrix).
 
-    The weight falls as the residual grows, so that a weighted residual answers to a change by less than its weight:
-    by ``weight - weight_fall residual^2``. This much of the noise in the columns biases the values.
+    The weight decreases with the residual, so the derivative of a weighted residual is smaller than its weight:
+    ``weight - weight_fall residual^2``. The noise in the columns biases the values in this proportion.
     """
     weights, weight_fall, size = np.ones(len(design)), np.zeros(len(design)), np.zeros(len(design))
     flat, values = design.reshape(-1, design.shape[2]), np.full(design.shape[2], np.inf)
@@ -150,7 +150,7 @@ def _robust_fit(design, target, alpha_noise):
 
 
 def jackknife_covariance(fit: Fit, centres: np.ndarray, cluster: float) -> np.ndarray:
-    """Leave out one stretch of time after the other: errors within one may be anything."""
+    """Delete-one-cluster jackknife over stretches of time: errors within a stretch may have any correlation."""
     label = np.unique(np.floor((centres - centres[0]) / cluster).astype(int), return_inverse=True)[1]
     shifts = []
     for group in range(label.max() + 1):
@@ -162,5 +162,5 @@ def jackknife_covariance(fit: Fit, centres: np.ndarray, cluster: float) -> np.nd
 
 
 def response(fit: Fit, columns: np.ndarray) -> np.ndarray:
-    """Return how the values answer to small changes of the left-hand side, columns (n, 3, k)."""
+    """Return the derivative of the values by small changes of the left-hand side, columns (n, 3, k)."""
     return np.linalg.solve(fit.hessian, np.einsum('npi,nik->pk', fit.weighted(slice(None)), columns, optimize=True))

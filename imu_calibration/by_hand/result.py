@@ -16,7 +16,7 @@ from imu_calibration.segmentation.window import Window, WindowKind
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HandResult(CalibrationResult):
-    """A calibration by hand with what a report needs beside it."""
+    """A calibration by hand with the data for its report."""
 
     hand: HandCalibration
     """Parameters, poses, noise and residuals."""
@@ -40,7 +40,7 @@ class HandResult(CalibrationResult):
 
     @property
     def singular_values(self) -> np.ndarray:
-        """None: the directions of the poses are estimated along."""
+        """Empty: the directions of the poses are estimated too."""
         return np.zeros(0)
 
     def first_rest(self) -> tuple[np.ndarray, np.ndarray]:
@@ -48,7 +48,7 @@ class HandResult(CalibrationResult):
         return self.hand.poses.force[0], self.hand.poses.rate[0]
 
     def window_errors(self) -> WindowErrors:
-        """Return the errors of the poses before and after: beside gravity along its estimated direction, and beside rest."""
+        """Return the errors of the poses before and after: relative to gravity along its estimated direction, and to zero rate."""
         hand, poses = self.hand, self.hand.poses
         force, rate = poses.force, poses.rate
         true, zero = hand.gravity * hand.state.up, np.zeros_like(rate)
@@ -62,11 +62,11 @@ class HandResult(CalibrationResult):
                             {'accelerometer': np.hypot(poses.force_sem, scatter[0]), 'gyroscope': np.hypot(poses.rate_sem, scatter[1])})
 
     def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
-        """None: by hand no windows are kept."""
+        """Empty: by hand no windows are stored."""
         return {}
 
     def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
-        """Return noise and gravity: there is no other reference. The sds contain the uncertainty of a gravity that was not given."""
+        """Return noise and gravity, the only reference. The sds contain the uncertainty of a gravity that was not given."""
         model, values, sd = self.calibration.model, self.calibration.values, self.calibration.sd
         known = self.options.gravity is not None
         gravity_sd = (self.options.gravity_sd or errors.gravity) if known else STANDARD_GRAVITY_SD

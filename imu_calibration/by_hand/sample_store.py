@@ -1,4 +1,4 @@
-"""What a live calibration by hand keeps of its stream: every sample as long as they fit, then what tells least goes first."""
+"""The sample store of a live calibration by hand: all samples up to a limit, then the least informative are discarded first."""
 
 import io
 from collections.abc import Iterable, Sequence
@@ -11,18 +11,18 @@ from imu_calibration.samples import ImuSamples
 
 FORMAT = 'imu_calibration/hand_samples/1'
 PAUSE_NS = 3600 * 10**9
-"""Pause that is put where a clock was set anew: no turn is taken across it."""
+"""Pause that is inserted at a clock reset: no turn is used across it."""
 REST_KEPT = 30.0
-"""Of a rest that is forgotten, this much stays at its start and at its end, s."""
+"""Of a rest that is discarded, this much is kept at its start and at its end, s."""
 HELD_OUT = 1.0
-"""Samples between two parts of one rest last no longer than this, s: what is kept out after a hole."""
+"""Longest distance of two parts of one rest, s: the time excluded after a hole."""
 SHARE_KEPT = 0.9
-"""Share of the samples that stays when some must go."""
+"""Share of the samples that is kept when some are discarded."""
 
 
 class HandStore:
     """
-    A bounded store of ImuSamples with rising stamps.
+    A bounded store of ImuSamples with increasing stamps.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class HandStore:
         return twin
 
     def add(self, accepted: Iterable[tuple[int, ImuSamples]]) -> None:
-        """Take what a StreamCheck accepted: (epoch, ImuSamples), ...; stamps go on rising where the clock was set anew."""
+        """Add the output of a StreamCheck: (epoch, ImuSamples), ...; stamps continue to increase at a clock reset."""
         for epoch, samples in accepted:
             if not len(samples):
                 continue
@@ -67,14 +67,14 @@ class HandStore:
 
     def forget(self, rests: Sequence[slice], most_rests: int) -> bool:
         """
-        Let samples go when there are too many: the inside of the longest rest when that is enough, else the oldest; return if any went.
+        Discard samples above the limit: the inside of the longest rest if that suffices, otherwise the oldest; return whether any were.
 
         Parameters
         ----------
         rests : list of slice
             Ranges at rest among `samples`.
         most_rests : int
-            Rests kept at most; the oldest go first.
+            Largest number of rests; the oldest are discarded first.
 
         """
         imu = self.samples()
@@ -110,7 +110,7 @@ class HandStore:
 
     def load(self, data: bytes) -> None:
         """
-        Put saved samples before what comes, as a recording with a pause in it.
+        Insert saved samples before new ones, as a recording with a pause in it.
 
         Raises
         ------
@@ -138,7 +138,7 @@ class HandStore:
 
 
 def _across_holes(stamp_ns, rests):
-    """Return the ranges at rest, joined where nothing but forgotten samples, and what is kept out after a hole, lies between them."""
+    """Return the ranges at rest, joined where only discarded samples and the time excluded after a hole lie between them."""
     joined, hole = [], 5 * np.median(np.diff(stamp_ns)) * 1e-9
     for rest in rests:
         between = np.diff(stamp_ns[joined[-1].stop - 1:rest.start + 1]) * 1e-9 if joined else np.zeros(0)

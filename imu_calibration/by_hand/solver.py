@@ -1,4 +1,4 @@
-"""The joint estimate of a calibration by hand: Gauss-Newton, scatter beyond the noise, what to hold, covariance."""
+"""The joint estimate of a calibration by hand: Gauss-Newton, scatter beyond the noise, fixed parameters, covariance."""
 
 from dataclasses import dataclass
 
@@ -15,9 +15,9 @@ from imu_calibration.estimation.scaled_solve import covariance_with_held
 from imu_calibration.estimation.variance_components import GroupVariances, estimate_group_variances
 
 ITERATIONS = 15
-"""Gauss-Newton steps at most; four to six are usual."""
+"""Largest number of Gauss-Newton steps; four to six are usual."""
 LOOSE = 1e4
-"""How much the priors are relaxed when the data alone are asked: enough to show nothing of them, little enough for rounding."""
+"""Factor on the prior sds for an estimate from the data: large enough to remove the priors, small enough for rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,15 +29,15 @@ class HandSolution:
     terms: Terms
     """Covariance of the parameters as named terms, each of shape (n, n)."""
     held: np.ndarray
-    """True where the prior's value was kept, shape (n,)."""
+    """True where a parameter is fixed at its prior, shape (n,)."""
     scatter: GroupVariances
     """Scatter of poses, drifts and turns beyond the noise."""
     factor: np.ndarray
     """Triangular factor of the weighted equations after directions and drifts are eliminated, shape (n, n)."""
     steps: int
-    """Gauss-Newton steps taken."""
+    """Number of Gauss-Newton steps."""
     model_error: ModelError
-    """What the covariance grew by, beyond noise and scatter."""
+    """Increase of the covariance beyond noise and scatter."""
 
 
 def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float, fallback: np.ndarray) -> HandSolution:
@@ -79,9 +79,9 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
 
 def choose_held(factor: np.ndarray, priors: np.ndarray) -> np.ndarray:
     """
-    Return which parameters the data say next to nothing about, shape (n,).
+    Return the parameters with next to no information from the data, shape (n,).
 
-    One after the other, the parameter whose sd (given those held so far) is largest in units of the prior's, while that
+    One after the other, the parameter whose sd (given those fixed so far) is largest in units of the prior's, while that
     exceeds one half.
 
     """
@@ -98,13 +98,13 @@ def choose_held(factor: np.ndarray, priors: np.ndarray) -> np.ndarray:
 
 
 def _data_sd(scaled):
-    """Return the sd of parameters in units of their priors, all but unlimited where the data are silent."""
+    """Return the sd of parameters in units of their priors, nearly unlimited without information from the data."""
     factor = np.linalg.qr(np.vstack([scaled, np.eye(scaled.shape[1]) / LOOSE]), mode='r')
     return np.linalg.norm(scipy.linalg.solve_triangular(factor, np.eye(len(factor))), axis=1)
 
 
 def first_state(model: HandModel, poses: Poses) -> State:
-    """Return a `State` from the norms in poses alone, which give directions too, and the rates at rest."""
+    """Return a `State` from the norms in poses, which determine directions too, and the rates at rest."""
     values, nominal, priors, gravity = model.nominal.copy(), model.nominal, model.priors, model.gravity
     for _ in range(ITERATIONS):
         residual, columns = model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
@@ -121,7 +121,7 @@ def first_state(model: HandModel, poses: Poses) -> State:
 
 
 def _iterate(model, state, poses, turns, free, priors, variance, fallback, memory):
-    """Repeat steps and scatter estimates until neither moves."""
+    """Repeat steps and scatter estimates until both converge."""
     count = len(poses.start)
     scatter = GroupVariances(np.array(variance, float), np.full(len(fallback), np.inf), np.array(variance, float))
     for number in range(1, ITERATIONS + 1):
@@ -132,7 +132,7 @@ def _iterate(model, state, poses, turns, free, priors, variance, fallback, memor
         noise = np.concatenate([system.noise, priors[free]**2])
         group = np.concatenate([system.component, np.full(free.sum(), -1)])
         before = scatter.variance
-        if number > 2:  # the first steps leave errors of linearisation that are not scatter
+        if number > 2:  # after the first steps there are errors of linearisation that are not scatter
             scatter = estimate_group_variances(design, residual, noise, group=group, start=scatter.variance, fallback=fallback)
         root = np.sqrt(scatter.total(noise, group))
         orthogonal, factor = np.linalg.qr(design / root[:, None])
@@ -166,14 +166,14 @@ def _of_scatter(model, state, poses, *, turns, scatter, free, memory):
 
 
 def _of_gravity(values, relative_sd):
-    """Return what a wrong gravity adds to the covariance: matrix / gravity is all that poses at rest see."""
+    """Return the contribution of a wrong gravity to the covariance: poses at rest determine only matrix / gravity."""
     common = np.zeros(len(values))
     common[3:3 + len(LOWER)] = values[3:3 + len(LOWER)]
     return relative_sd**2 * np.outer(common, common)
 
 
 def _of_earth(model, state, poses, free):
-    """Return what the Earth's rate about the vertical adds to the covariance: what the biases and the answers to gravity take of it."""
+    """Return the contribution of the Earth's rate about the vertical to the covariance, through biases and responses to gravity."""
     slopes = model.further('gyroscope', state.values, model.gravity * state.up, rate=np.zeros_like(state.up), time=poses.time,
                            temperature_c=poses.temperature_c)[1]
     own = np.concatenate([np.arange(GYRO_BIAS.start, GYRO_BIAS.stop), model.extra_index('gyroscope')]).astype(int)

@@ -1,4 +1,4 @@
-"""How far a calibration by hand has come: poses, attitudes and turns so far, and the direction or motion that is missing."""
+"""Progress of a calibration by hand: poses, attitudes and turns so far, and the missing direction or motion."""
 
 from dataclasses import dataclass
 
@@ -27,20 +27,20 @@ SEEN = np.pi / 4
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What the search for rest found in the samples so far."""
+    """Result of the search for rest in the samples so far."""
 
     rests: list
     """Ranges at rest (slice)."""
     poses: Poses | None
     """Their means; None without any rest."""
     attitudes: int
-    """Different attitudes."""
+    """Number of different attitudes."""
     turns: int
-    """Turns between consecutive poses that can be used."""
+    """Number of usable turns between consecutive poses."""
     dropped: dict
-    """Reason -> turns that cannot be used."""
+    """Reason -> number of unusable turns."""
     resting: float
-    """How long the IMU has been at rest now, s; 0 while it moves."""
+    """Duration of the current rest, s; 0 in motion."""
 
 
 NOTHING = Findings([], None, 0, 0, {}, 0.0)
@@ -70,9 +70,9 @@ def hand_status(found: Findings, calibration: Calibration | None, *, gravity_unk
     calibration : Calibration or None
         The last solution.
     gravity_unknown : bool
-        Whether the standard gravity stands in for the local one.
+        Whether the standard gravity replaces the local one.
     step : str
-        What to do next in the words of the planner (`advice`), '' where no pose brings anything.
+        Next step in the planner's text (`advice`), '' when no pose has a gain.
     hints : dict, optional
         As for `errors.with_hint`.
 

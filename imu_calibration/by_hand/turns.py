@@ -1,4 +1,4 @@
-"""From samples to the turns between poses, and which of them can be used."""
+"""Usable turns between poses, from samples."""
 
 import numpy as np
 
@@ -8,22 +8,22 @@ from imu_calibration.samples import ImuSamples, runs_of
 from imu_calibration.segmentation.stamping import LAG, LATE, MOST_LOST, WHOLE
 
 TOP = 20
-"""Readings below the largest that tell how closely readings lie there."""
+"""Readings below the largest whose density is estimated."""
 CROWDED = 20.0
-"""Times as many readings at the extreme as chance puts there are the end of the range."""
+"""The extreme is the end of the range when it has this many times the readings expected by chance."""
 CERTAIN = 1e-3
-"""With chance readings below this, two that are equal are no chance, neighbours neither."""
+"""If fewer readings than this are expected, two equal ones are the end of the range, also neighbours."""
 LINE = 20.0
-"""A clock counts as straight over so many seconds: long against the jitter of its stamps, short against the drift of its rate."""
+"""Duration over which a clock is straight, s: long against the jitter of its stamps, short against the drift of its rate."""
 UNDECIDED = 1.02
-"""Interpolation errors at even times may exceed those at the stamps by this factor, from noise."""
+"""Factor by which interpolation errors at even times may exceed those at the stamps, due to noise."""
 SUMMIT = 3
-"""Neighbours that the top of one smooth turn may leave in the same coarse step."""
+"""Neighbours in one coarse step at the top of a smooth turn."""
 
 
 def collect_turns(time: np.ndarray, imu: ImuSamples, *, poses: Poses, settings: ByHandSettings,
                   temperature_c: np.ndarray | None = None) -> tuple[list[TurnData], dict[str, int]]:
-    """Return (turns between consecutive poses, {reason: count of those left out}); `temperature_c` is that of the samples or None."""
+    """Return (turns between consecutive poses, {reason: count of excluded ones}); `temperature_c` is that of the samples or None."""
     turns, dropped, rate = [], {}, imu.rate_s
     limit = max(settings.gap, 5 * poses.period)
     ended = at_range_end(rate)
@@ -49,10 +49,10 @@ def _unusable(time, ended, gap, longest):
 
 def at_range_end(rate: np.ndarray) -> np.ndarray:
     """
-    Return which samples stand at the end of the gyroscope's range, shape (n,).
+    Return which samples are at the end of the gyroscope's range, shape (n,).
 
-    Where the range ends, different motions end at the same reading, on either side and on all axes; without it two readings are
-    hardly ever both the largest, as far as the converter's step is finer than the distance between the largest readings.
+    At the end of the range, different motions end at the same reading, on either side and on all axes; without it two readings are
+    hardly ever both the largest, if the converter's step is finer than the distance between the largest readings.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def _at_end(values, fresh):
     some = np.sort(values[fresh].ravel())[-4000:]
     step = np.diff(some)
     step = step[step > 1e-9 * np.abs(some[-1])].min(initial=np.inf)
-    margin = 1.5 * step if np.isfinite(step) and values.shape[1] > 1 else 0.5 * step   # two's complement: one end is a step further out
+    margin = 1.5 * step if np.isfinite(step) and values.shape[1] > 1 else 0.5 * step   # two's complement: one end is larger by a step
     margin = min(margin, 1e-4 * np.abs(some[-1]))
     at = (values >= some[-1] - margin).any(axis=1)
     below = some[some < some[-1] - margin][-TOP:]
@@ -87,7 +87,7 @@ def _at_end(values, fresh):
 
 def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, *, poses: Poses, settings: ByHandSettings,
                     temperature_c: np.ndarray | None = None) -> TurnData:
-    """Return the data of a `KnownTurn`; its axis is known as well as the axis setting says, across it."""
+    """Return the data of a `KnownTurn`; the sd of its axis is that of the settings, across the axis."""
     axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
     along = np.outer(axis, axis)
     cov = settings.known_turn_sd**2 * along + (turn.angle * settings.known_axis_sd)**2 * (np.eye(3) - along)
@@ -100,10 +100,10 @@ def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, *, poses
 
 def sample_times(imu: ImuSamples) -> np.ndarray:
     """
-    Return the times of samples since the first one, s, shape (n,): those of the clock that the stamps follow, or the stamps.
+    Return the times of samples since the first one, s, shape (n,): of the clock fitted to the stamps, or the stamps.
 
     An even clock is a straight line through the stamps over the count of the samples, in pieces of `LINE` seconds. It is used unless the
-    readings interpolate better from their neighbours at the stamps, as those of a driver do that polls the sensor at uneven moments.
+    readings interpolate better from their neighbours at the stamps, as with a driver that polls the sensor at uneven times.
     """
     stamps = rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
     even, period = stamps.copy(), float(np.median(np.diff(stamps)))
@@ -115,7 +115,7 @@ def sample_times(imu: ImuSamples) -> np.ndarray:
             lines = (_clock_line(each, stamps[part], max(1, int(period * len(part) / LINE))) for each in (number[part], part))
             line = min(lines, key=lambda line: np.sum((stamps[part] - line)**2))   # long steps of a rebuilt clock need not be lost samples
             late = np.array([piece.mean() for piece in np.array_split(stamps[part] - line, len(part) // LAG)])
-            even[part] = line if np.abs(late).max() < 0.6 * period else even[part]   # else samples were lost unnoticed
+            even[part] = line if np.abs(late).max() < 0.6 * period else even[part]   # otherwise samples were lost unnoticed
     return even if np.all(np.diff(even) > 0) and _roughness(even, imu.rate_s) <= UNDECIDED * _roughness(stamps, imu.rate_s) else stamps
 
 
@@ -132,7 +132,7 @@ def _roughness(time, rate):
 
 
 def rising(time: np.ndarray) -> np.ndarray:
-    """Spread repeated stamps over the step that follows: their order is known, their moments are not."""
+    """Spread repeated stamps over the following step: their order is known, their times are not."""
     if np.all(np.diff(time) > 0):
         return time
     kept = np.concatenate([[True], np.diff(time) > 0])

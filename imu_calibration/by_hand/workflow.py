@@ -1,4 +1,4 @@
-"""A calibration by hand as the same document and result that a calibration on a table gives."""
+"""A calibration by hand with the same document and result as a calibration on a table."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -38,11 +38,11 @@ class HandRecording:
     temperature_c: np.ndarray | None
     """Temperature at the samples, degrees Celsius, shape (n,), when it was recorded."""
     counts: dict
-    """Reason -> samples that could not be used."""
+    """Reason -> number of unusable samples."""
 
     @property
     def gathered(self) -> Gathered:
-        """What a document says of the recording besides its parameters."""
+        """Data of the recording for the document, without parameters."""
         imu, warm = self.imu, self.temperature_c
         return Gathered(counts=self.counts, frame_id=imu.frame_id, first_stamp_ns=int(imu.stamp_ns[0]), last_stamp_ns=int(imu.stamp_ns[-1]),
                         largest_rate=float(np.sqrt((imu.rate_s**2).sum(axis=1).max())), largest_force=float(np.abs(imu.force_s).max()),
@@ -51,12 +51,12 @@ class HandRecording:
 
 def read_by_hand(blocks: Iterable[SampleBlock], nominal: NominalScaling | None = None, watchers: Sequence[Watcher] = ()) -> HandRecording:
     """
-    Return the `HandRecording` of a whole stream of SampleBlock; `nominal` and `watchers` as for the `BlockCleaner`.
+    Return the `HandRecording` of a complete stream of SampleBlock; `nominal` and `watchers` as for the `BlockCleaner`.
 
     Raises
     ------
     InputError
-        When no usable sample is left.
+        When no usable sample remains.
 
     """
     cleaner, imus, temperatures = BlockCleaner(nominal=nominal, watchers=watchers), [], []
@@ -75,7 +75,7 @@ def read_by_hand(blocks: Iterable[SampleBlock], nominal: NominalScaling | None =
 
 
 def read_imu(blocks: Iterable[SampleBlock], watchers: Sequence[Watcher] = ()) -> tuple[ImuSamples, dict[str, int]]:
-    """Return (ImuSamples, counts of what was dropped) of a whole recording, cleaned; raises as `read_by_hand`."""
+    """Return (ImuSamples, counts of dropped samples) of a recording, cleaned; raises as `read_by_hand`."""
     recording = read_by_hand(blocks, watchers=watchers)
     return recording.imu, recording.counts
 
@@ -96,7 +96,7 @@ def calibrate_without_table(sources: Sequence[Callable], options: CalibrationOpt
     Raises
     ------
     InputError
-        When more than one recording comes, or an effect is asked for that needs a table.
+        When more than one recording is given, or a requested effect needs a table.
 
     """
     if len(sources) != 1:
@@ -108,14 +108,14 @@ def calibrate_without_table(sources: Sequence[Callable], options: CalibrationOpt
 
 def calibrate_samples_by_hand(recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None,
                               *, stills: Sequence[slice] | None = None, findings: Sequence[CheckFinding] = ()) -> HandResult:
-    """Return the HandResult of a HandRecording; `stills` as in `calibrate_by_hand`, `findings` of a look at the recording."""
+    """Return the HandResult of a HandRecording; `stills` as in `calibrate_by_hand`, `findings` of a check of the recording."""
     return evident_result(recording, options, provenance, stills=stills, findings=findings)[0]
 
 
 def evident_result(recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None, *,
                    stills: Sequence[slice] | None = None, findings: Sequence[CheckFinding] = (),
                    progress: Callable | None = None) -> tuple[HandResult, EvidentHand]:
-    """Return (the HandResult, what was found on the way to it); arguments as in `calibrate_samples_by_hand`, `progress` of the search."""
+    """Return (the HandResult, the search results); arguments as in `calibrate_samples_by_hand`, `progress` of the search."""
     asked = hand_options(options)
     data = gather_by_hand(recording.imu, stills, asked.settings, temperature_c=recording.temperature_c)
     evident = solve_by_evidence(data, asked, as_asked=options.as_asked, progress=progress)
@@ -125,12 +125,12 @@ def evident_result(recording: HandRecording, options: CalibrationOptions = Calib
 def hand_result(evident: EvidentHand, recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), *,
                 provenance: dict | None = None, findings: Sequence[CheckFinding] = (), turns: Sequence[TurnData] = ()) -> HandResult:
     """
-    Return an EvidentHand as the result that reports and documents know, proven on its poses and `turns` where these are enough.
+    Return an EvidentHand as a result for reports and documents, evaluated on its poses and `turns` if these are enough.
 
     Raises
     ------
     InputError
-        When the specific force at rest is plainly in another unit.
+        When the specific force at rest is clearly in another unit.
 
     """
     hand = with_weak_replaced(evident.hand)
