@@ -262,12 +262,11 @@ def test_inspect_names_the_fault(capsys, tmp_path, session, fault, check, severi
     imu, joints, temperature = fault(session.imu, session.joints, session.temperature)
     write_session(str(tmp_path / 'bag'), imu, joints, temperature=temperature)
     code = main(['inspect', str(tmp_path / 'bag')])
-    printed = ' '.join(capsys.readouterr().out.split())
-    found = [f for f in findings(fault(session.imu, session.joints, session.temperature)) if f.check == check and f.severity == severity]
+    printed, every = ' '.join(capsys.readouterr().out.split()), findings((imu, joints, temperature))
+    found = [f for f in every if f.check == check and f.severity == severity]
     assert found and [word for word in words if word not in ' '.join(f.text for f in found)] == []
     assert all(f'{severity} {check.replace("_", " ")} {" ".join(f.text.split())}' in printed for f in found)
-    worst = {f.severity for f in findings(fault(session.imu, session.joints, session.temperature))}
-    assert code == (1 if REFUSE in worst else 3)
+    assert code == (1 if REFUSE in {f.severity for f in every} else 3)
 
 
 @pytest.mark.parametrize('fault', sorted({fault for fault, _, severity, _ in FAULTS if severity == REFUSE}, key=lambda f: f.__name__))
