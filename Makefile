@@ -131,7 +131,7 @@ fuzz: $(STAMP)
 	@$(PY) test/fuzz/run.py --minutes $(MINUTES)
 
 hide-and-seek: $(STAMP)
-	@$(PY) test/worlds/hide_and_seek.py
+	@$(PY) validation/hide_and_seek.py
 
 # The pages as a searchable site for a browser without a network; warnings and requests to other hosts are errors.
 docs: .venv-docs/.installed

@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from worlds.hide_and_seek_figures import missed
-from worlds.hide_and_seek_sections import both_found, by_grade, print_pairs, print_sizes, separable, wrong_names
+from validation.hide_and_seek_figures import missed
+from validation.hide_and_seek_sections import both_found, by_grade, print_pairs, print_sizes, separable, wrong_names
+
 from worlds.hide_and_seek_worlds import GRADES, REALISTIC, _each, effects_of_seed, pairs_of_seed, run, tasks_of
 from worlds.hiding import passing, threshold_noncentrality
 

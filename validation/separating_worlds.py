@@ -1,5 +1,5 @@
 """
-Does the motion that is planned to tell causes apart leave the right name? ``python -m worlds.separating_worlds`` in test/.
+Does the motion that is planned to tell causes apart leave the right name? ``PYTHONPATH=test python -m validation.separating_worlds``.
 
 A physical cause is hidden in a unit on a table, and a short round is driven by habit: the faces, one spin about each axis, a swing. Where the diagnosis
 of that names a class of effects that it cannot tell apart, the planner makes at most three minutes of motion for the same unit, and the diagnosis is asked

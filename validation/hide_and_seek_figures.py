@@ -5,9 +5,10 @@ from datetime import date
 
 import numpy as np
 
+from validation.hide_and_seek_report import class_sizes, first_is_right, strictly_first
+from validation.hide_and_seek_sections import both_found, by_grade, kind_of, separable, wrong_names
+
 from worlds import beyond_catalogue
-from worlds.hide_and_seek_report import class_sizes, first_is_right, strictly_first
-from worlds.hide_and_seek_sections import both_found, by_grade, kind_of, separable, wrong_names
 
 BARS = {'white': '97 %', 'realistic': '95 %'}
 """Share of single effects that is to be named first."""

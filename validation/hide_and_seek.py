@@ -1,7 +1,7 @@
 """
 Hide and seek: effects are hidden in sessions made by physics, and `diagnose` has to find them.
 
-Run as ``python test/worlds/hide_and_seek.py`` (or ``make hide-and-seek``): two hours of processor time. Prints a confusion matrix and the
+Run as ``python validation/hide_and_seek.py`` (or ``make hide-and-seek``): two hours of processor time. Prints a confusion matrix and the
 figures, draws them into docs/, and lists the sessions of which the record in the repository tells another thing. ``--seeds``, ``--minutes 20``,
 ``--pairs 100`` and ``--parts effects,none`` run less, and draw beside the record; what was run stands beside every figure. Rows are written as they
 come, so that ``--from-record`` counts what there is of a run that was stopped, or of several that ran apart.
@@ -18,11 +18,13 @@ from pathlib import Path
 
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
     os.environ.setdefault(_name, '1')
-sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parents[2])]
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
+
+from validation.hide_and_seek_figures import write_figures  # noqa: E402
+from validation.hide_and_seek_report import report  # noqa: E402
 
 from worlds import hide_and_seek_record as record_kept  # noqa: E402
-from worlds.hide_and_seek_figures import write_figures  # noqa: E402
-from worlds.hide_and_seek_report import report  # noqa: E402
 from worlds.hide_and_seek_worlds import GRADES, PARTS, failed, run, tasks_of  # noqa: E402
 
 FIRST_SEED = 277000
@@ -50,7 +52,7 @@ def main(arguments=None):
     parser.add_argument('--keep', action='store_true', help='take the rows into the record of the repository')
     options = parser.parse_args(arguments)
     part_of_it = options.from_record or options.effects or options.minutes or options.noise or options.pairs or set(options.parts) != set(PARTS) or len(options.grades) < len(GRADES)
-    docs = options.docs or (options.record.parent if part_of_it else Path(__file__).resolve().parents[2] / 'docs')
+    docs = options.docs or (options.record.parent if part_of_it else ROOT / 'docs')
     rows = [row for path in options.from_record for row in record_kept.read(path)] if options.from_record else _work(tasks_of(options), options)
     report(rows, docs)
     write_figures(rows, docs)

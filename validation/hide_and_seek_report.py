@@ -5,8 +5,9 @@ from datetime import date
 
 import numpy as np
 
+from validation.hide_and_seek_sections import by_grade, kind_of, print_pairs, print_sizes
+
 from worlds import beyond_catalogue
-from worlds.hide_and_seek_sections import by_grade, kind_of, print_pairs, print_sizes
 
 
 def report(rows, docs):
