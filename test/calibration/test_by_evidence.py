@@ -159,7 +159,7 @@ def test_a_rival_widens_by_its_weight_and_is_named_beside_the_finding(late, exam
     added = [_disagreement(replace(found, denied=[], doubtful=[], rivals=[rival]), names)[0, 0] for rival in rivals]
     assert added[0] == pytest.approx(0.5 * 0.3**2) and added[1] < 1e-200
     beside = replace(found, rivals=[replace(rivals[0], other=found.attempt.questions[0])])
-    mates = told(found.used, late[1], beside).findings[0].indistinguishable_from
+    mates = told(late[1], beside).findings[0].indistinguishable_from
     assert mates[0] == found.attempt.questions[0].name
 
 

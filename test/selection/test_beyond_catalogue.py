@@ -154,7 +154,7 @@ def test_the_place_is_found(kind, size):
 
 def test_the_formula_is_printed():
     (recording, cause), (found, _, _) = recorded('scale_under_load'), looked('scale_under_load')
-    lines = '\n'.join(diagnosis_lines(told(recording.windows, recording.table, without_superseded(found))))
+    lines = '\n'.join(diagnosis_lines(told(recording.table, without_superseded(found))))
     assert all(part in lines for part in ('f_z * w', f'axis {min(cause.axes)}', found.proposal('gyroscope').sentence))
 
 

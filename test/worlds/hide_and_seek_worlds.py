@@ -112,7 +112,7 @@ def effects_of_seed(seed, noise, effects, profile='random', table='three_axis', 
 def nothing_of(sizes, seed, noise):
     """Return the row of the session that gave the sizes."""
     empty, start = sizes.recording, time.process_time()
-    diagnosis = told(empty.windows, empty.table, sizes.found)
+    diagnosis = told(empty.table, sizes.found)
     return [_row(diagnosis, empty.truth, None, sizes.seconds + time.process_time() - start, {'part': 'none', 'seed': seed, 'noise': noise})]
 
 
