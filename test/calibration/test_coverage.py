@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.by_hand.advice import WEIGHTS, _rollout, foretold
-from imu_calibration.by_hand.hand_step import HandStep, shortest_turn
+from imu_calibration.by_hand.hand_step import HandStep, direction_words, shortest_turn
 from imu_calibration.by_hand.live import LiveByHand
 from imu_calibration.by_hand.next_pose import hand_coverage, knowledge_of
 from imu_calibration.by_hand.options import HandOptions
@@ -243,5 +243,5 @@ def test_the_picture_of_the_readme_can_be_drawn(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(ROOT / 'examples')
     import coverage_picture
     first, on_the_way, last = coverage_picture.states()
-    assert first.seconds > on_the_way.seconds > 0 and 'hold it still with' in on_the_way.next.text and len(on_the_way.seen) == 7
+    assert first.seconds > on_the_way.seconds > 0 and direction_words(on_the_way.next.up) in on_the_way.next.text and len(on_the_way.seen) == 7
     assert last.done and not last.next.text
