@@ -75,7 +75,7 @@ def test_a_session_is_told_line_by_line_each_once(bench, session, tmp_path):
     assert f'written: {tmp_path}/calibration.yaml and {tmp_path}/calibration.accumulator.npz' in saved.message
     assert calibration_from_text((tmp_path / 'calibration.yaml').read_text()).decisions == dict.fromkeys(('accelerometer', 'gyroscope'), 'helps')
     assert bench.heard(f'calibrates on the table {TABLE} with the joints outer, middle, inner; ~/save writes {tmp_path}/calibration.yaml') == 1
-    for words in ('Imu messages come on /imu/data_raw from /tester, reliable', 'JointState messages come on /joint_states from /tester, reliable',
+    for words in ('on /imu/data_raw from /tester, reliable', 'on /joint_states from /tester, reliable',
                   'first window gathered', '~/save: '):
         assert bench.heard(words) == 1, (words, bench.said)
     assert bench.status[CALIBRATION].values and not bench.heard('Traceback')
@@ -85,7 +85,7 @@ def test_a_session_is_told_line_by_line_each_once(bench, session, tmp_path):
 def test_topics_that_are_mistyped_are_told_with_the_nearest_of_the_type(bench, session, tmp_path):
     node = start(bench, tmp_path)
     imu, joints = ((kind, bench.node.create_publisher(kind, topic, 10)) for kind, topic in ((Imu, '/imu/data_rwa'), (JointState, '/table/joint_states')))
-    bench.until(lambda: bench.heard('nothing comes on /imu/data_raw (sensor_msgs/msg/Imu): there is /imu/data_rwa; listen to it with '
+    bench.until(lambda: bench.heard('/imu/data_raw (sensor_msgs/msg/Imu): there is /imu/data_rwa; listen to it with '
                                     '-r imu/data_raw:=/imu/data_rwa', 'warning'), 'the nearest Imu topic')
     bench.until(lambda: bench.heard('there is /table/joint_states', 'warning'), 'the nearest JointState topic')
     bench.until(lambda: bench.lines().get(STREAMS, (0, ''))[0] == ERROR, 'the same on /diagnostics')
@@ -97,7 +97,7 @@ def test_a_place_that_cannot_be_written_is_told_at_the_start_and_costs_nothing(b
     (tmp_path / 'file').write_text('here already')
     place = {'a file as parent': tmp_path / 'file' / 'calibration.yaml', 'a name too long': tmp_path / ('x' * 300 + '.yaml')}[kind]
     node = start(bench, tmp_path, save_file=str(place), autosave_period=0.2)
-    bench.until(lambda: bench.heard('nothing could be saved now', 'error'), 'the place')
+    bench.until(lambda: bench.heard('saving failed', 'error'), 'the place')
     send(bench, *session)
     gathered(bench, node)
     answer = bench.call('/calibration_node/save')
@@ -129,11 +129,11 @@ def test_at_its_end_unsaved_motion_is_kept_where_a_place_was_given_and_told_lost
     send(bench, *session, ('/other/imu/data_raw', '/other/joint_states'))
     for node in (kept, lost):
         gathered(bench, node)
-    assert kept.close().endswith(f'windows were in no file: they are kept in {tmp_path}/calibration.accumulator.npz; resume:=true goes on with them')
+    assert f'{tmp_path}/calibration.accumulator.npz; resume:=true' in kept.close()
     assert "windows were in no file and are lost: call ~/save, or give parameter 'save_file'" in lost.close()
     again = start(bench, tmp_path, resume=True)
     assert again.worker.live.n_windows >= kept.worker.live.n_windows > 0   # those that were still open count as well
-    assert bench.heard(f'goes on with {again.worker.live.n_windows} windows from {tmp_path}/calibration.accumulator.npz') == 1
+    assert bench.heard(f'continued with {again.worker.live.n_windows} windows from {tmp_path}/calibration.accumulator.npz') == 1
     kept.close = lost.close = lambda: None
 
 
@@ -145,7 +145,7 @@ def test_motion_of_another_model_or_a_damaged_file_is_put_aside_and_the_session_
     first.close = lambda: None
     other = start(bench, tmp_path, resume=True, accelerometer_model='bias+matrix+accel_quadratic')
     assert other.worker.live.n_windows == 0 and (tmp_path / 'calibration.accumulator.npz.1').is_file()
-    assert bench.heard('must hold the columns of the model that is asked for', 'error') == 1 and bench.heard('the earlier motion is kept in', 'error') == 1
+    assert bench.heard(f'earlier motion is in {tmp_path}/calibration.accumulator.npz.1', 'error') == 1
     (tmp_path / 'calibration.accumulator.npz').write_bytes(b'damaged')
     assert start(bench, tmp_path, resume=True).worker.live.n_windows == 0
     assert (tmp_path / 'calibration.accumulator.npz.2').read_bytes() == b'damaged'
@@ -160,7 +160,7 @@ def test_whatever_fails_within_is_told_and_the_session_goes_on(bench, session, t
     send(bench, *session)
     bench.until(lambda: bench.heard('take failed and is left out: ZeroDivisionError', 'error'), 'the fault')
     answer = bench.call('/calibration_node/save')
-    assert not answer.success and 'nothing written' in answer.message
+    assert not answer.success and 'no file was written' in answer.message
     live.push = whole
     bench.until(lambda: not node.worker.state.faults, 'that it is over')
     send(bench, *session)

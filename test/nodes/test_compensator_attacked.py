@@ -88,10 +88,10 @@ def test_nothing_bad_displaces_what_is_in_force(bench, place):
         assert [node.convert(data, {'source_timestamp': 1}) is None for data in MESSAGES] == [out is None for out in expected]
     publisher.publish(String(data=OTHER_TEXT))
     bench.until(lambda: bench.lines()[STATUS][1].endswith('(helps)'), 'the good one')
-    assert bench.heard(f'{version_of(OTHER_TEXT)} from topic /imu/calibration (helps) taken over') == 1
+    assert bench.heard(f'{version_of(OTHER_TEXT)} from topic /imu/calibration (helps) adopted') == 1
     publisher.publish(String(data=OTHER_TEXT + '\n'))   # another document that says the same
     bench.until(lambda: node.adopted.version == version_of(OTHER_TEXT + '\n'), 'the same again')
-    assert bench.heard('taken over') == 2   # the file's and the other one's
+    assert bench.heard(') adopted') == 2   # the file's and the other one's
     assert node.set_parameters([Parameter('anyway', value=True)])[0].successful
     publisher.publish(String(data=REFUSED['unproven'][0]))
     bench.until(lambda: node.adopted.version == version_of(REFUSED['unproven'][0]), 'the unproven one, with consent')
@@ -108,7 +108,7 @@ def test_nothing_bad_displaces_what_is_in_force(bench, place):
 def test_a_file_that_was_named_is_not_displaced_unless_asked(bench, place):
     node = bench.start(CompensatorNode, {'calibration_file': str(place)})
     bench.node.create_publisher(String, 'imu/calibration', latched_qos()).publish(String(data=OTHER_TEXT))
-    bench.until(lambda: bench.heard("is not taken: parameter 'adopt' is 'file_then_topic'"), 'a word about it')
+    bench.until(lambda: bench.heard("was not adopted: parameter 'adopt' is 'file_then_topic'"), 'a word about it')
     assert node.adopted.version == version_of(GOOD_TEXT)
     assert node.set_parameters([Parameter('adopt', value='topic')])[0].successful
     assert node.adopted.version == version_of(OTHER_TEXT)   # what was heard meanwhile
@@ -161,13 +161,13 @@ def test_a_temperature_that_is_nan_or_stops_is_told(bench, tmp_path, monkeypatch
     publisher = bench.node.create_publisher(Temperature, 'imu/temperature', 10)
     bench.until(publisher.get_subscription_count, 'a subscription')
     node.convert(MESSAGES[0], {'source_timestamp': 1})
-    bench.until(lambda: 'no temperature came yet' in bench.lines().get(STATUS, (0, ''))[1], 'that it waits')
+    bench.until(lambda: 'no temperature was received' in bench.lines().get(STATUS, (0, ''))[1], 'that it waits')
     publisher.publish(Temperature(temperature=float('nan')))
     bench.until(lambda: 'temperatures on /imu/temperature must be finite' in bench.lines()[STATUS][1], 'NaN')
     publisher.publish(Temperature(temperature=28.0))
     bench.until(lambda: node.compensation.dt is not None, 'the temperature')
-    bench.until(lambda: 'the last one, 28.0 C, stays in use' in bench.lines()[STATUS][1], 'that it stopped')
-    assert 'publishes it and sends nothing' in bench.lines()[STATUS][1]
+    bench.until(lambda: 'the last one, 28.0 C, remains in use' in bench.lines()[STATUS][1], 'that it stopped')
+    assert 'is a publisher but does not send' in bench.lines()[STATUS][1]
 
 
 def test_any_publisher_connects_and_two_are_told(bench, place, monkeypatch):

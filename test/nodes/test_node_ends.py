@@ -88,7 +88,7 @@ sys.exit(run_node(lambda: rclpy.create_node('ends'), [], spin=spin))
 
 
 @pytest.mark.parametrize(('what', 'code', 'words'), (
-    ("raise ValueError('nobody foresaw this')", 1, 'error: the node cannot go on: ValueError: nobody foresaw this\n'),
+    ("raise ValueError('nobody foresaw this')", 1, 'error: the node cannot continue: ValueError: nobody foresaw this\n'),
     ("raise __import__('imu_calibration.errors', fromlist=['x']).InputError('a bag must be there; name one')", 1, 'error: a bag must be there; name one\n'),
     ('node.failed = True', 1, ''), ('pass', 0, '')), ids=('unforeseen', 'refused', 'failed', 'done'))
 def test_a_node_that_cannot_go_on_says_so_and_ends_with_another_code(what, code, words):

@@ -265,7 +265,7 @@ def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_pa
         assert loop.value('state') == 'idle' and loop.value('motion') == '0'   # nothing moves before start
         loop.ask('next')
         loop.until(lambda: loop.value('motion') == '1' and loop.value('state') == 'idle', 'the end of one motion')
-        assert 'rests until the next motion is asked for' in loop.drive()
+        assert 'rests until the next motion is requested' in loop.drive()
         loop.ask('start')
         loop.until(lambda: loop.value('state') in ('done', 'stopped'), 'the end', 180.0)
         assert loop.drive().startswith('done: ') and int(loop.value('motion')) >= 3, loop.drive()
@@ -273,7 +273,7 @@ def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_pa
         loop.until(lambda: documents, 'the calibration')
         assert loop.processes.end(loop.planner) == 0
     said = (tmp_path / 'out.txt').read_text()
-    assert 'motion 1, ' in said and 'asking what the model gets wrong' in said and 'Traceback' not in said
+    assert 'motion 1, ' in said and '; diagnosing' in said and 'Traceback' not in said
 
 
 @pytest.mark.long

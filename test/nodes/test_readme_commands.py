@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.live]
 PATIENCE = 90.0
 PLANNER = '/planner_node/'
 """What is asked of who drives; without a table it answers why nothing moves."""
-ANSWERS = {'/calibration_node/solve': 'success=True', '/calibration_node/save': '/ws/calibration.yaml', '/calibration_node/reset': 'started anew',
+ANSWERS = {'/calibration_node/solve': 'success=True', '/calibration_node/save': '/ws/calibration.yaml', '/calibration_node/reset': 'restarted',
            'param describe': 'Fixed|settling', 'param set': 'Set parameter successful', 'topic echo /diagnostics': 'name: .*calibration_node: streams',
            'imu inspect': 'gravity reads 9.78', 'imu watch': 'streams .*messages come', 'ros2 doctor': 'checks passed',
            PLANNER: r'success=\w+, message=.\w+'}
@@ -159,7 +159,7 @@ def answered(terminals, command):
 @pytest.mark.long
 def test_three_terminals_calibrate_and_compensate_and_answer(terminals, home):
     simulator, calibrator, compensator = map(terminals, THREE)
-    calibrator.wait('Imu messages come on /imu/data_raw from /simulator_node', 'JointState messages come', 'first window gathered')
+    calibrator.wait('Imu messages are received on /imu/data_raw from /simulator_node', 'JointState messages are received', 'first window gathered')
     while not lists(terminals('ros2 node list'), '/calibration_node'):   # the daemon that ros2 starts finds the nodes after a while
         pass
     for command in commands():
