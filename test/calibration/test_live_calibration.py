@@ -309,7 +309,7 @@ def test_streams_are_watched_by_silence_stamps_and_losses():
     watch = StreamWatch()
     assert watch.state(0.0).word == 'silent'
     watch.note(stream_block(100, 0), 0.0)
-    assert 'no JointState messages come' in watch.state(1.0).message
+    assert 'no JointState messages received' in watch.state(1.0).message
     watch.note(stream_block(100, 100), 1.0)
     state = watch.state(1.0)
     assert state.word == 'good' and state.values['imu rate [Hz]'] == '100.0'

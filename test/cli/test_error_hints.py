@@ -58,9 +58,11 @@ def test_no_text_of_the_core_tells_to_run_a_verb():
 NAMED = {'setting': 'the text has the names of parameters of the node', 'imu_topic': 'no readings are compared'}
 UNREACHABLE = {
     'calibration_node': {'nominal': 'readings are converted in the driver, which the error says', 'anyway': 'no calibration is applied',
-                         'columns': 'no text log is read', 'force': 'results of verbs', 'up': 'of transforms in a bag', 'setting': NAMED['setting']},
+                         'columns': 'no text log is read', 'force': 'results of verbs', 'up': 'of transforms in a bag', 'setting': NAMED['setting'],
+                         'calibration': 'no recording is replayed'},
     'planner_node': {'anyway': 'no calibration is applied', **NAMED, 'nominal': 'no readings are compared', 'gravity': 'no calibration is estimated',
-                     'calibration': 'with a plan for separation alone', 'diagnose': 'no calibration is estimated', 'inspect': 'no calibration is estimated'},
+                     'calibration': 'with a plan for separation alone', 'diagnose': 'no calibration is estimated', 'inspect': 'no calibration is estimated',
+                     'temperature_topic': 'no recording is replayed'},
     'compensator_node': {'allow_xacro': 'no robot description is read'},
     'bag_player_node': {'allow_xacro': 'no robot description is read'},
 }

@@ -185,7 +185,7 @@ def test_joint_states_without_positions_and_zero_stamps_are_named(bench, session
     bench.until(silent.get_subscription_count, 'a subscription')
     for _ in range(20):
         silent.publish(JointState(name=['outer', 'middle', 'inner']))
-    bench.until(lambda: bench.heard('nothing on /joint_states can be used: 20 JointState without a position for every name'), 'the empty position')
+    bench.until(lambda: bench.heard('no message on /joint_states is usable: 20 JointState without a position for every name'), 'the empty position')
     assert not bench.heard('must name outer, middle, inner')
     to = bench.node.create_publisher(Imu, 'imu/data_raw', 1000)
     bench.until(to.get_subscription_count, 'a subscription')

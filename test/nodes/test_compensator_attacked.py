@@ -83,7 +83,7 @@ def test_nothing_bad_displaces_what_is_in_force(bench, place):
         publisher.publish(String(data=text))
         bench.until(lambda: any(word in bench.lines().get(STATUS, (0, ''))[1] for word in words.split('|')), f'the refusal of {name}')
         level, line = bench.lines()[STATUS]
-        assert level == ERROR and f'{version_of(GOOD_TEXT)} stays' in line and '\n' not in line
+        assert level == ERROR and f'{version_of(GOOD_TEXT)} remains in use' in line and '\n' not in line
         assert bench.heard('was refused', 'error')
         assert [node.convert(data, {'source_timestamp': 1}) is None for data in MESSAGES] == [out is None for out in expected]
     publisher.publish(String(data=OTHER_TEXT))
