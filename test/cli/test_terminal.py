@@ -4,7 +4,6 @@ import fcntl
 import io
 import os
 import pty
-import signal
 import struct
 import subprocess
 import sys
@@ -110,4 +109,3 @@ def test_an_early_interruption_ends_with_130_in_one_line(moment, tmp_path):
                'from imu_calibration.__main__ import main\nsys.exit(main())\n')
     done = subprocess.run([sys.executable, '-c', program, 'inspect', SESSION], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 130 and done.stderr.count('\n') == 1 and 'Traceback' not in done.stderr, done.stderr
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
