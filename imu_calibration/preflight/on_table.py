@@ -59,7 +59,7 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
 
 def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckFinding | None:
     """Return the finding of joints or IMU axes that are exchanged or reversed, or None if a delay explains the rates better."""
-    shift = _best_shift([window for window in windows if len(window) >= LEAST_SAMPLES], table)
+    shift = _best_shift(windows, table)
     late = abs(shift.seconds) > LEAST_SHIFT and shift.share > exchange.share - ALIKE
     if late and shift.share > exchange.share + ALIKE:
         return None
@@ -74,9 +74,6 @@ def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckF
 
 def _cause(windows, table):
     """Return the delay with which the streams agree, or ''."""
-    windows = [window for window in windows if len(window) >= LEAST_SAMPLES]
-    if not windows:
-        return ''
     shift = _best_shift(windows, table)
     late = abs(shift.seconds) > LEAST_SHIFT and shift.share > max(SAME, shift.unshifted + ALIKE)
     return _late(shift.seconds) if late else ''
@@ -84,9 +81,6 @@ def _cause(windows, table):
 
 def _a_period_late(windows, table):
     """Return the finding for streams of a repeating motion that agree clearly better a period earlier or later, or None."""
-    windows = [window for window in windows if len(window) >= LEAST_SAMPLES]
-    if not windows:
-        return None
     shift, share, unshifted, ambiguous = _best_shift(windows, table)
     # opposite rates: a wrong sign, or half a period
     if ambiguous or abs(shift) <= LEAST_SHIFT or unshifted < 0 or share < max(SURE, unshifted + ALIKE):
@@ -138,9 +132,6 @@ def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
     table : Table
 
     """
-    windows = [window for window in windows if len(window) >= LEAST_SAMPLES]
-    if not windows:
-        return None
     shift, share, unshifted, _ = _best_shift(windows, table)
     if abs(shift) <= LEAST_SHIFT or share < SAME or share < -unshifted - ALIKE:
         return None
@@ -149,10 +140,13 @@ def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
 
 def _best_shift(windows, table):
     """
-    Return the `_Shift` that explains the rates best; of equally good ones, the smallest.
+    Return the `_Shift` that explains the rates best; of equally good ones, the smallest; without samples, no shift.
 
     ``share(s) = c |c| / (e_m e_r)`` with c the sum of measured(t) reference(t - s) and e their sums of squares, all of the same pairs.
     """
+    windows = [window for window in windows if len(window) >= LEAST_SAMPLES]
+    if not windows:
+        return _Shift(0.0, 0.0, 0.0, False)
     period = float(np.median([window.period for window in windows]))
     start, end = windows[0].time[0], windows[-1].time[-1]
     measured, reference = np.zeros((2, int((end - start) / period) + 2, 3))
