@@ -73,11 +73,11 @@ class DistanceSums:
         count = len(EDGES) - 1
         self._power = {sensor: np.zeros((2, count, 3)) for sensor in SENSORS}
         self._rest = {sensor: np.zeros((count, 3)) for sensor in SENSORS}
-        self._means = {sensor: np.zeros((2, 2, 3)) for sensor in SENSORS}   # all windows, windows at rest
+        self._means = {sensor: np.zeros((2, 3)) for sensor in SENSORS}
         self._rows: dict[str, list] = {sensor: [] for sensor in SENSORS}
         self._noise = {sensor: np.zeros(3) for sensor in SENSORS}
         self._freedom = np.zeros((2, count))   # of all windows, of windows at rest
-        self._samples, self._windows = 0, np.zeros(2)
+        self._samples = self._windows = 0
 
     def add(self, window: Window, residuals: Sequence[Mapping[str, np.ndarray]], noise: Mapping[str, NoiseModel]) -> None:
         """Add a window with its residuals (before, after: sensor -> (n, 3)) and the noise of each sensor."""
@@ -88,10 +88,9 @@ class DistanceSums:
         place = np.clip(np.searchsorted(EDGES, line, side='right') - 1, 0, len(EDGES) - 2)
         freedom = np.full(len(line), 2.0)
         freedom[-1] = 1.0 if n % 2 == 0 else 2.0
-        which = [0, 1] if rest else [0]
-        self._freedom[which] += np.bincount(place, freedom, len(EDGES) - 1)
+        self._freedom[:2 if rest else 1] += np.bincount(place, freedom, len(EDGES) - 1)
         self._samples += n
-        self._windows[which] += 1
+        self._windows += 1
         for sensor in SENSORS:
             self._noise[sensor] += noise[sensor].low_variance / n
             row = [n, rest]
@@ -100,7 +99,7 @@ class DistanceSums:
                 squares = np.abs(np.fft.rfft(own[sensor], axis=0)[1:])**2 * freedom[:, None] / n
                 band = np.stack([np.bincount(place, column, len(EDGES) - 1) for column in squares.T], axis=1)
                 self._power[sensor][k] += band
-                self._means[sensor][which, k] += mean**2
+                self._means[sensor][k] += mean**2
                 row += [band.sum(), mean @ mean]
                 if rest and k == len(residuals) - 1:
                     self._rest[sensor] += band
@@ -117,7 +116,7 @@ class DistanceSums:
         nearest = np.abs(np.arange(edge - 1)[:, None] - known).argmin(axis=1) if len(known) else []
         noise = density[nearest] * self._freedom[0][:edge - 1, None] if len(known) else np.zeros((edge - 1, 3))
         return Distance(EDGES[:edge], self._power[sensor][:, :edge - 1] / self._samples, noise / self._samples,
-                        self._means[sensor][0] / self._windows[0], self._noise[sensor] / self._windows[0], self._gains(sensor))
+                        self._means[sensor] / self._windows, self._noise[sensor] / self._windows, self._gains(sensor))
 
     def _gains(self, sensor):
         """Return measure -> Gain, in the order of `MEASURES`."""

@@ -13,12 +13,11 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.navigation import drift_over
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window, all_samples, chunks
+from imu_calibration.selection.saturation import measured
 from imu_calibration.simulation.replay import predict_windows
 
 BLOCK = 0.25
 """Residuals are averaged over this time for plots, s."""
-
-
 DEAD_RECKONING = 50.0
 """Length of dead reckoning, s."""
 GAP = 0.1
@@ -90,16 +89,16 @@ def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *
     models = before, after
     sums, parts, counts, warmth = DistanceSums(), [], [], []
     for group in chunks([window for window in windows if window.kind != 'unused']):
-        residuals, against = _errors(group, table, models)
+        residuals, against = _errors(group, table, models), _variables(group, table, before)
         ends = np.cumsum([len(window) for window in group])
         for window, stop in zip(group, ends):
             rows = slice(stop - len(window), stop)
             sums.add(window, [{sensor: own[rows] for sensor, own in each.items()} for each in residuals], before.noise)
-        block, number = _blocks(group)
+        block, number, n_blocks = _blocks(group)
         values = [np.concatenate([w.time for w in group]), *against[:3], *(each[s] for each in residuals for s in SENSORS)]
         parts.append([_block_mean(value, block, number) for value in values])
         warmth.append(None if against[3] is None else _block_mean(against[3], block, number))
-        counts.append((number, np.repeat([str(w.kind) for w in group], [_n_blocks(w) for w in group])))
+        counts.append((number, np.repeat([str(w.kind) for w in group], n_blocks)))
     known = [each for each in warmth if each is not None]
     temperature = np.concatenate(known) if len(known) == len(warmth) else None
     time, position, force_s, rate_s, *errors = (np.concatenate(column) for column in zip(*parts))
@@ -121,8 +120,7 @@ def _largest(time, residual):
 def _segment(windows, table, models, sensor, axis, start, stop):
     inside = [window for window in windows if window.time[-1] >= start and window.time[0] <= stop]
     time = np.concatenate([window.time for window in inside])
-    measured = np.concatenate([_measured(window)[sensor][:, axis] for window in inside])
-    found = {'measured': measured}
+    found = {'measured': np.concatenate([measured(window, sensor)[:, axis] for window in inside])}
     for name, model in zip(('simulated before', 'simulated after'), models):
         found[name] = predict_windows(inside, table, model.model, values=model.values)[sensor][:, axis]
     rows = np.flatnonzero((time >= start) & (time <= stop))
@@ -131,20 +129,19 @@ def _segment(windows, table, models, sensor, axis, start, stop):
     return OverlaySegment(time[rows].mean(axis=1), {name: signal[rows].mean(axis=1) for name, signal in found.items()})
 
 
-def _measured(window):
-    return {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
-
-
 def _errors(windows, table, models):
-    """Return (measured minus predicted of each model by sensor, (position, force, rate, temperature) of the reference)."""
+    """Return sensor -> measured minus predicted, of each model."""
+    outputs = {sensor: np.concatenate([measured(window, sensor) for window in windows]) for sensor in SENSORS}
+    predicted = (predict_windows(windows, table, model.model, values=model.values) for model in models)
+    return [{sensor: outputs[sensor] - each[sensor] for sensor in SENSORS} for each in predicted]
+
+
+def _variables(windows, table, model):
+    """Return position, specific force, rate and temperature (or None) of the reference at the samples, at the values of a model."""
     motion, temperature, rows = all_samples(windows)
-    found = []
-    for model in models:
-        predicted = predict_windows(windows, table, model.model, values=model.values)
-        found.append({s: np.concatenate([_measured(w)[s] for w in windows]) - predicted[s] for s in SENSORS})
-    first = _references(models[0], table, motion, temperature)
-    return found, (motion.position[rows], first['accelerometer'].force_s[rows], first['gyroscope'].rate_s[rows],
-                   None if temperature is None else temperature[rows])
+    reference = _references(model, table, motion, temperature)
+    return (motion.position[rows], reference['accelerometer'].force_s[rows], reference['gyroscope'].rate_s[rows],
+            None if temperature is None else temperature[rows])
 
 
 def _references(model, table, motion, temperature):
@@ -153,18 +150,11 @@ def _references(model, table, motion, temperature):
 
 
 def _blocks(windows):
-    """Return the block of each sample and the number of samples of each block; blocks end with their window."""
-    first = np.cumsum([0, *(_n_blocks(window) for window in windows)])
-    block = np.concatenate([start + _place(window) for start, window in zip(first, windows)])
-    return block, np.bincount(block)
-
-
-def _place(window):
-    return np.unique(((window.time - window.time[0]) / BLOCK).astype(int), return_inverse=True)[1]
-
-
-def _n_blocks(window):
-    return int(_place(window)[-1]) + 1
+    """Return the block of each sample, the number of samples of each block and of blocks of each window; blocks end with their window."""
+    places = [np.unique(((window.time - window.time[0]) / BLOCK).astype(int), return_inverse=True)[1] for window in windows]
+    n_blocks = [int(place[-1]) + 1 for place in places]
+    block = np.concatenate([start + place for start, place in zip(np.cumsum([0, *n_blocks]), places)])
+    return block, np.bincount(block), n_blocks
 
 
 def _block_mean(values, block, number):
@@ -197,7 +187,7 @@ def _drifts(windows, table, models):
     """Return the Drift of each model over the first `DEAD_RECKONING` seconds of some windows."""
     motion, temperature, rows = all_samples(windows)
     time, found = np.concatenate([window.time for window in windows]), []
-    for model, error in zip(models, _errors(windows, table, models)[0]):
+    for model, error in zip(models, _errors(windows, table, models)):
         reference, felt = _references(model, table, motion, temperature), {}
         for sensor in SENSORS:
             matrix = model.model.value(sensor, Role.LINEAR, model.values)
