@@ -7,11 +7,10 @@ import numpy as np
 from imu_calibration.effects.base import Effect
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.selection.questions import time_constants
 
 PASSES = 6
 """Most passes over a recording with repeated linearisation."""
-
-
 STARTS = 6
 """Number of start values of the time constant, with a ratio of 2.3: the iteration converges from a start within this factor."""
 LINEAR_STEPS = 25
@@ -26,7 +25,7 @@ def linearise_again(model: SensorModel, solution: Solution) -> SensorModel | Non
 def at_time_constants(model: SensorModel, effect: Effect, duration: float) -> list[SensorModel]:
     """Return the model with the columns of a warm-up at each of several time constants that a recording of `duration` s can show."""
     return [replace(model, point={**model.point, effect.name: effect.at_time_constant(constant)})
-            for constant in np.geomspace(max(duration / 30, 5.0), 2 * duration, STARTS)]
+            for constant in time_constants(duration, STARTS)]
 
 
 def _cautious(solution):

@@ -63,7 +63,8 @@ class Attempt:
                  point: tuple[SensorModel, np.ndarray] | None = None, bias_processes: dict | None = None, progress: Callable | None = None,
                  any_size: bool = False, resolved: AbstractSet[str] = frozenset()):
         self.baseline, self.effects, self.locked = baseline, effects, locked
-        self.constants = time_constants(max(float(w.time[-1]) for w in windows))
+        self.duration = max(float(window.time[-1]) for window in windows)
+        self.constants = time_constants(self.duration)
         model, values = point or _start(baseline, effects)
         model = replace(model, folded_arms=mean_arms(model, values))
         recording = reduce_recording(windows, table, model, values=values, bank=make_bank(effects, self.constants, model, values=values),
@@ -115,7 +116,7 @@ class Attempt:
         """Return the evidence of an effect's curvature, nats: its separability from its first derivative."""
         without = self.search.used([q for q in chosen if q is not question])
         weight = self.evidence.loss(without) - self.evidence.loss(self.search.used(chosen))
-        return weight * _curvature(question, self.values(chosen), self.recording.model, self.constants[-1] / 2)**2
+        return weight * _curvature(question, self.values(chosen), self.recording.model, self.duration)**2
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """

@@ -136,9 +136,9 @@ def _why_not(effect, have, table, kinds, span):
     return effect.moot(table) if effect.moot else None
 
 
-def time_constants(duration: float) -> np.ndarray:
-    """Return the time constants of the bank of warm-ups, s."""
-    return np.geomspace(max(duration / 30, 5.0), 2.0 * duration, N_TIME_CONSTANTS)
+def time_constants(duration: float, number: int = N_TIME_CONSTANTS) -> np.ndarray:
+    """Return time constants of warm-ups that a recording of `duration` s determines, s, shape (number,); default those of the bank."""
+    return np.geomspace(max(duration / 30, 5.0), 2.0 * duration, number)
 
 
 def extended_model(model: SensorModel, effects: Sequence[Effect]) -> SensorModel:
