@@ -1,5 +1,6 @@
 """Documents as YAML text: the calibration, the table, tolerances. The same content gives the same bytes."""
 
+import math
 import re
 from enum import StrEnum
 from functools import cache
@@ -21,6 +22,11 @@ FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]{1,3}$')
 """Numbers such as 1e-6 and 1.5e3: the rules of YAML 1.1 require a point and a sign of the exponent; YAML 1.2, ROS and JSON do not."""
 DEEPEST = 20
 """Deepest nesting of lists and mappings; the stack of a recursive parser overflows well above it."""
+
+
+def finite(value: float) -> float | None:
+    """Return a float, or None for an infinite value or NaN, which documents do not contain."""
+    return float(value) if math.isfinite(value) else None
 
 
 def to_text(document: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.allan.figures import HORIZON, AxisFigures, NoiseFigures, TrendFigure
 from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, WEAK, Term
-from imu_calibration.documents import from_text, to_text
+from imu_calibration.documents import finite, from_text, to_text
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.errors import DocumentError, InputError
 
@@ -63,14 +63,9 @@ def _sensor_section(sensor, axes):
 def _entry(terms, unit):
     """Return value, interval, status, reason and unit of three axes; None where an axis has no such figure."""
     return {'value': [None if term is None or term.value is None else float(term.value) for term in terms],
-            'interval95': [None if term is None else [_finite(end) for end in term.interval] for term in terms],
+            'interval95': [None if term is None else [finite(end) for end in term.interval] for term in terms],
             'status': [None if term is None else term.status for term in terms],
             'reason': ['' if term is None else term.reason for term in terms], 'unit': unit}
-
-
-def _finite(value):
-    """Return a float, None where there is no bound: files hold no infinite numbers."""
-    return float(value) if math.isfinite(value) else None
 
 
 def _trends(sensor, axes):
@@ -88,8 +83,8 @@ def _trends(sensor, axes):
 def _for_filters(figures, sensor, horizon):
     """Return the parameters of most filters, continuous and at the rate of the recording."""
     found = figures.densities(sensor, horizon)
-    return {'white_noise': found.white, 'random_walk': _finite(found.walk), 'random_walk_is': found.basis,
-            'sample_sd': found.sample_sd(figures.rate), 'bias_step_sd': _finite(found.step_sd(figures.rate))}
+    return {'white_noise': found.white, 'random_walk': finite(found.walk), 'random_walk_is': found.basis,
+            'sample_sd': found.sample_sd(figures.rate), 'bias_step_sd': finite(found.step_sd(figures.rate))}
 
 
 def noise_from_text(text: str) -> NoiseFigures:

@@ -14,6 +14,7 @@ from imu_calibration.calibration.model_changes import ModelChanges
 from imu_calibration.calibration.status import reasons_held, statuses
 from imu_calibration.calibration.uncorrected import Uncorrected
 from imu_calibration.calibration.verdict import judged
+from imu_calibration.documents import finite
 from imu_calibration.effects.applied import centred
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation import observability
@@ -110,7 +111,7 @@ def statistics(solution: Solution, gathered: Gathered) -> dict:
         result[sensor] = {
             'noise_sd': noise.white_sd, 'low_frequency_factor': noise.inflation, 'between_window_sd': noise.offset_sd,
             'wander_sd': float(np.sqrt(noise.bias_variance)), 'wander_time_s': noise.bias_time,
-            'residual_rms_moving': _finite(solution.residual_rms[sensor][0]),
+            'residual_rms_moving': finite(solution.residual_rms[sensor][0]),
             'residual_rms_window_means': solution.residual_rms[sensor][1], 'chi2_per_dof': solution.chi2_per_dof[sensor]}
         if sensor in solution.session_biases:
             result[sensor] |= {'between_recordings_sd': noise.session_sd, 'bias_of_recordings': solution.session_biases[sensor]}
@@ -129,10 +130,6 @@ def statistics(solution: Solution, gathered: Gathered) -> dict:
 def preflight_statistics(findings: Sequence[CheckFinding]) -> dict:
     """Return the findings of the checks of the recording as a part of the statistics."""
     return {'preflight': [finding.to_mapping() for finding in warnings(findings)], 'unusable': unusable(findings)}
-
-
-def _finite(value):
-    return float(value) if np.isfinite(value) else None
 
 
 def conditions(gathered: Gathered, gravity: float) -> dict:
