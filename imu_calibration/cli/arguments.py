@@ -44,6 +44,14 @@ def stand_of(options: Namespace) -> Stand | None:
     return Arm(options.urdf, options.imu_link, options.table, options.up, options.allow_xacro)
 
 
+def add_gravity_arguments(parser: OneLineParser) -> None:
+    """Add the options of local gravity: its value, or the place."""
+    common = parser.common.add_argument
+    common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
+    common('--latitude', metavar='DEG', type=float, help='gravity from the latitude (WGS 84)')
+    common('--height', metavar='M', type=float, help='and height above the ellipsoid, default 0 m')
+
+
 def add_result_arguments(parser: OneLineParser) -> None:
     """Add the options of the written result."""
     parser.common.add_argument('--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml')

@@ -27,10 +27,10 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.units import with_sd
     from imu_calibration.use_cases.recordings import Topics, open_bag, source_of
     if len(options.imu_topic) != 2:
-        raise InputError(f'--imu-topic must be given twice, A and B, it came {len(options.imu_topic)} times; name both IMUs')
+        raise InputError(f'--imu-topic must be given twice, A and B, got {len(options.imu_topic)}; name both IMUs')
     frames = options.frame_id or [None, None]
     if len(frames) != 2:
-        raise InputError(f'--frame-id must be given twice, for A and B, or not at all, it came {len(frames)} time(s); name both frames')
+        raise InputError(f'--frame-id must be given twice, for A and B, or omitted, got {len(frames)}; name both frames')
     topics = [Topics(imu=topic, frame=frame) for topic, frame in zip(options.imu_topic, frames)]
     if len({(topic.lstrip('/'), frame) for topic, frame in zip(options.imu_topic, frames)}) == 1:
         raise InputError(f'A and B must be two IMUs, got {options.imu_topic[0]} twice; name another topic, or a frame_id for each',

@@ -14,9 +14,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common, expert = parser.common.add_argument, parser.expert.add_argument
     parser.add_argument('bags', nargs='+', metavar='BAG', help=arguments.BAG)
     common('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
-    common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
-    common('--latitude', metavar='DEG', type=float, help='gravity from the latitude (WGS 84)')
-    common('--height', metavar='M', type=float, help='and height above the ellipsoid, default 0 m')
+    arguments.add_gravity_arguments(parser)
     expert('--earlier', metavar='FILE', help='earlier calibration.yaml to compare (table only)')
     common('--no-report', action='store_true', help='write calibration.yaml only')
     expert('--jobs', type=int, help='recordings read at a time, default one per core')

@@ -13,9 +13,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common = parser.common.add_argument
     parser.add_argument('bag', metavar='BAG', help=arguments.BAG)
     common('--output', metavar='DIR', required=True, help='folder for diagnosis.json, calibration.yaml and report.html')
-    common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
-    common('--latitude', metavar='DEG', type=float, help='in place of --gravity: WGS 84 normal gravity at this latitude')
-    common('--height', metavar='M', type=float, help='height above the ellipsoid for --latitude, m; default 0')
+    arguments.add_gravity_arguments(parser)
     arguments.add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
     arguments.add_topic_arguments(parser)
     arguments.add_result_arguments(parser)

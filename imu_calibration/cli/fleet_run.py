@@ -24,6 +24,7 @@ from imu_calibration.report.page import render
 from imu_calibration.units import for_people, significant, with_sd
 from imu_calibration.use_cases.choices import topics_of
 from imu_calibration.use_cases.pool import cluster_mapper, jobs_for, process_mapper
+from imu_calibration.use_cases.provenance import provenance_with
 from imu_calibration.use_cases.stand import table_of
 
 HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical_sd', 'spread_over_sd', 'lowest', 'lowest_unit', 'highest',
@@ -34,7 +35,9 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
     """Calibrate every unit of a folder."""
     found = find_units(options.folder, options.output)
     table = _table(options, [path for _, paths in found for path in paths])
-    units = [unit_of(name, paths, choices_of(options), joint_names=table.joint_names, stand=stand_of(options)) for name, paths in found]
+    choices = choices_of(options)
+    used = provenance_with('fleet', (), choices, stand=stand_of(options))['options']
+    units = [unit_of(name, paths, topics_of(choices), joint_names=table.joint_names, options=used) for name, paths in found]
     folder = files.make_folder(options.output)
     advance = counter('units', len(units))
     mapper = _mapper(options, len(units), lambda result: advance(1))

@@ -3,14 +3,12 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from imu_calibration.calibration.fleet import Unit
 from imu_calibration.errors import InputError
 from imu_calibration.reference.joint import JointNames
-from imu_calibration.use_cases.choices import Choices, topics_of
-from imu_calibration.use_cases.provenance import provenance_with
-from imu_calibration.use_cases.recordings import provenance_of, source_of
-from imu_calibration.use_cases.stand import Stand
+from imu_calibration.use_cases.recordings import Topics, provenance_of, source_of
 from msg_adapters.storages import suffixes
 
 
@@ -56,9 +54,8 @@ def is_bag(path: Path) -> bool:
     return (path / 'metadata.yaml').exists() or any(inner.suffix in suffixes() for inner in path.iterdir())
 
 
-def unit_of(name: str, paths: Sequence[Path], choices: Choices, *, joint_names: JointNames, stand: Stand | None = None) -> Unit:
+def unit_of(name: str, paths: Sequence[Path], topics: Topics, *, joint_names: JointNames, options: dict[str, Any]) -> Unit:
     """Return the Unit with sources that read the bags without reporting progress."""
     paths = [path.resolve() for path in paths]
-    sources = tuple(source_of(path, topics_of(choices), joint_names, quiet=True) for path in paths)
-    options = provenance_with('fleet', (), choices, stand=stand)['options']
+    sources = tuple(source_of(path, topics, joint_names, quiet=True) for path in paths)
     return Unit(name, sources, tuple(path.name for path in paths), partial(provenance_of, paths, options))

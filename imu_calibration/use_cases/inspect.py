@@ -58,14 +58,16 @@ class Look:
 def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
     """Return the topics with the requested Imu topic, or with each one of the recording, and each frame_id if one has several."""
     names = [topics.imu] if topics.imu is not None else imu_topics(list_topics(bag))
-    if topics.frame is not None:
-        return [topics._replace(imu=name) for name in names] or [topics]
-    found = []
-    for each in [topics._replace(imu=name) for name in names]:
-        with open_bag(bag, each, want_joints=False, want_temperature=False) as recording:
-            frames = recording.frames()
-        found += [each._replace(frame=frame) for frame in frames] if len(frames) > 1 else [each]
+    found = [topics._replace(imu=name) for name in names]
+    if topics.frame is None:
+        found = [part for each in found for part in _by_frame(bag, each)]
     return found or [topics]
+
+
+def _by_frame(bag, topics):
+    with open_bag(bag, topics, want_joints=False, want_temperature=False) as recording:
+        frames = recording.frames()
+    return [topics._replace(frame=frame) for frame in frames] if len(frames) > 1 else [topics]
 
 
 def inspect(bag: str | PathLike, topics: Iterable[Topics], table: Table | None, *, options: CalibrationOptions) -> list[Look]:

@@ -86,6 +86,5 @@ def noise(recording: str | PathLike | SampleBlock, *, imu_topic: str | None = No
     """
     topics = Topics(imu_topic, None, temperature_topic, frame_id)
     result = identify_noise(source_of(recording, topics), nominal_of(nominal))
-    options = {name: value for name, value in (('imu_topic', imu_topic), ('temperature_topic', temperature_topic), ('frame_id', frame_id))
-               if value}
+    options = {name: value for name, value in topics.chosen().items() if value}
     return IdentifiedNoise(result, figures_of(result, provenance_of([recording], options)), horizon)

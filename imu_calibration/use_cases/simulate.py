@@ -146,12 +146,13 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
     topics = topics_of(choices)
     given = table_of(table, [recording], topics, gravity=choices.get('gravity'))
     known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
-    model, values = _truth(given, known, '', seed, None)
+    _require_joints(known, given)
     noise = None
     if all('noise_sd' in known.statistics.get(sensor, {}) for sensor in SENSORS):
         noise = {sensor: ReplayNoise(*known.noise(sensor), known.statistics[sensor].get('wander_time_s') or BIAS_TIME)
                  for sensor in SENSORS}
-    samples, lost = run_replay(source_of(recording, topics, given.joint_names)(), given, model, values=values, noise=noise, seed=seed)
+    samples, lost = run_replay(source_of(recording, topics, given.joint_names)(), given, known.model, values=known.values, noise=noise,
+                               seed=seed)
     truth = replace(known, provenance={'simulated': {'seed': seed, 'replay': name_of(recording)}})
     stamps = cast(ImuSamples, samples.imu).stamp_ns
     return Simulated(samples, given, truth, 1e-9 * float(stamps[-1] - stamps[0]), lost)
@@ -159,16 +160,20 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
 
 def _truth(table, calibration, grade, seed, catalogue):
     """Return (model, values) of the true IMU."""
-    names = table.joint_names
     if calibration is None:
-        model = SensorModel(NAMED_MODELS['size_effect'], joint_names=names, catalogue=catalogue)
+        model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names, catalogue=catalogue)
         return model, random_values(model, grade, seed)
     known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
-    if known.model.reference and set(known.model.joint_names) != set(names):
-        theirs = ', '.join(known.model.joint_names)
-        raise InputError(f"the calibration must be of a table with joints {', '.join(names)}, it names {theirs}; give the table it was "
-                         'made with', key='table')
+    _require_joints(known, table)
     return known.model, known.values
+
+
+def _require_joints(calibration, table):
+    """Refuse a calibration with effects of the reference for joints that differ from those of the table."""
+    names, known = table.joint_names, calibration.model.joint_names
+    if calibration.model.reference and set(known) != set(names):
+        raise InputError(f"the calibration must be of a table with joints {', '.join(names)}, it names {', '.join(known)}; give its table",
+                         key='table')
 
 
 def _with_effect(model, values, name, sensor, hidden):
