@@ -135,7 +135,7 @@ class Recording:
             When the JointState messages do not name the joints of the table.
 
         """
-        decoders = self._decoders(joint_names)
+        decoders = self._decoders(joint_names, self.frame_id)
         parts, n_samples = {}, 0
         for stretch in self.source.stretches(list(decoders)):
             for topic, arrived in stretch.items():
@@ -153,7 +153,7 @@ class Recording:
         if parts or last.dropped:
             yield last
 
-    def _decoders(self, joint_names):
+    def _decoders(self, joint_names, frame_id):
         source, decoders = self.source, {}
         for topic in filter(None, (self.imu_topic, self.joint_topic, self.temperature_topic)):
             message_type = source.types[topic]
@@ -162,15 +162,14 @@ class Recording:
             if message_type == JOINT_STATE_TYPE:
                 decoders[topic] = JointDecoder(joint_names, deserialize)
             elif message_type == IMU_TYPE:
-                decoders[topic] = ImuDecoder(FrameChoice(topic, self.frame_id), deserialize)
+                decoders[topic] = ImuDecoder(FrameChoice(topic, frame_id), deserialize)
             else:
                 decoders[topic] = Decoder(message_type, deserialize)
         return decoders
 
     def frames(self) -> list[str]:
         """Return the frames of the first stretch of the Imu topic, in order of name; [] without messages."""
-        decoder = self._decoders(None)[self.imu_topic]
-        decoder.choice.frame_id = ''   # several frames are no error here
+        decoder = self._decoders(None, '')[self.imu_topic]   # with a chosen frame, several frames are no error
         for stretch in self.source.stretches([self.imu_topic]):
             if self.imu_topic in stretch:
                 decoder.decode(*stretch[self.imu_topic])
