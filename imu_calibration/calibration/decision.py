@@ -15,7 +15,7 @@ AT_REST = 0.7
 """An error at rest of at least this share of the total is attributed to the bias."""
 DELAY_SHARE = 0.1
 """A delay is named as a cause where it explains this share of the residual."""
-ONE_ATTITUDE = '; unproven for other attitudes, because all held-out windows have the same attitude'
+OTHER_ATTITUDES = '; unproven for other attitudes, because all held-out windows have the same attitude'
 NO_PROOF = 'its error on held-out data was not measured'
 
 
@@ -62,7 +62,7 @@ def reason_of(entry: Mapping | None) -> str:
         return NO_PROOF
     earlier = entry.get('earlier')
     more = f', {_error(earlier["after"], entry["unit"])} with the earlier calibration' if earlier else ''
-    cause = ONE_ATTITUDE if entry.get('one_attitude') else '' if decide(entry) is HELPS else _cause(entry)
+    cause = OTHER_ATTITUDES if entry.get('one_attitude') else '' if decide(entry) is HELPS else _cause(entry)
     return (f'error {_error(entry["before"], entry["unit"])} to {_error(entry["after"], entry["unit"])} on held-out data '
             f'({entry["windows"]} windows, {_ratio(entry)}){more}{cause}')
 

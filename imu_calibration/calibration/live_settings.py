@@ -44,6 +44,6 @@ class LiveByHandSettings:
 
     def at_place(self, options: CalibrationOptions) -> CalibrationOptions:
         """Return the options with the gravity of these settings and its standard deviation."""
-        known = self.gravity or self.latitude > 90
-        gravity, spread = local_gravity(self.gravity or None) if known else local_gravity(None, self.latitude, self.height)
+        place = () if self.gravity or self.latitude > 90 else (self.latitude, self.height)
+        gravity, spread = local_gravity(self.gravity or None, *place)
         return replace(options, gravity=gravity, gravity_sd=spread)

@@ -122,9 +122,11 @@ def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
 
 
 def _decided(calibration, sensor, word):
-    entry = calibration.proof.get(sensor) or {'one_attitude': True}
-    step, key = ('', None) if word is HELPS else ('record more windows, or hold it still in more attitudes', None) \
-        if entry.get('one_attitude') else ('find the cause', 'diagnose')
+    entry, step, key = calibration.proof.get(sensor), '', None
+    if word is not HELPS and entry and not entry.get('one_attitude'):
+        step, key = 'find the cause', 'diagnose'
+    elif word is not HELPS:
+        step = 'record more windows, or hold it still in more attitudes'
     return Reason(DECISION, f'{sensor} {word}: {_reason(calibration, sensor)}', step, key=key, sensors=(sensor,))
 
 
