@@ -108,7 +108,7 @@ def _candidates(n_joints):
 
 
 def _joint_phrases(names, order, signs):
-    return tuple(f'{names[k]} turns {"the other way round" if j == k else ("as " if sign > 0 else "against what ") + names[j] + " should"}'
+    return tuple(f'{names[k]} turns {"the other way round" if j == k else f"as {names[j]} should" + ", reversed" * (sign < 0)}'
                  for k, (j, sign) in enumerate(zip(order, signs)) if k != j or sign < 0)
 
 
