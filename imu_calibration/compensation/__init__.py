@@ -2,5 +2,5 @@
 The model inverted.
 
 In: raw samples and a calibration. Out: corrected samples with their covariance, for a recording or sample by sample.
-Start with `compensate`.
+Read `compensate` first.
 """
