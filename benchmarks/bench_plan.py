@@ -28,10 +28,12 @@ from imu_calibration.effects.named_models import NAMED_MODELS  # noqa: E402
 from imu_calibration.effects.sensor_model import SensorModel  # noqa: E402
 from imu_calibration.planning.belief import exact_information  # noqa: E402
 from imu_calibration.planning.coordinates import Coordinates  # noqa: E402
-from imu_calibration.planning.noise import noise_of_grade  # noqa: E402
 from imu_calibration.planning.planner import Planner, make_planner  # noqa: E402
 from imu_calibration.planning.repertoire import Repertoire  # noqa: E402
-from imu_calibration.planning.situation import Situation  # noqa: E402
+from imu_calibration.planning.situation import (
+    Situation,  # noqa: E402
+    noise_of_grade,  # noqa: E402
+)
 from imu_calibration.reference.motion_limits import limits_of  # noqa: E402
 from imu_calibration.samples import SampleBlock  # noqa: E402
 from imu_calibration.simulation.motion_builder import Profile  # noqa: E402

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from imu_calibration import files
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.exports.registry import all_targets
+from imu_calibration.exports.export import all_targets
 from imu_calibration.samples import ImuSamples
 from imu_calibration.use_cases.compensate import compensate
 from imu_calibration.use_cases.exporting import export_calibration

@@ -24,8 +24,10 @@ from imu_calibration import files  # noqa: E402
 from imu_calibration.compensation.stops import StopDetector  # noqa: E402
 from imu_calibration.effects.forward_equations import sensor_output  # noqa: E402
 from imu_calibration.nodes.processes import NodeProcesses  # noqa: E402
-from imu_calibration.reference.reference_motion import Reference  # noqa: E402
-from imu_calibration.reference.rotations import align  # noqa: E402
+from imu_calibration.reference.reference_motion import (
+    Reference,  # noqa: E402
+    align,  # noqa: E402
+)
 from imu_calibration.samples import ImuSamples  # noqa: E402
 from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
 from msg_adapters.imu_stream import ImuStream  # noqa: E402

@@ -8,8 +8,22 @@ from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import NotObservableError
 from imu_calibration.papers import zhang2017 as zhang
 from imu_calibration.papers import zhang2017_navigation as zhang_claims
-from imu_calibration.papers.zhang2017_designs import DESIGNS, design_runs, face, oscillation, skewed_axes, spin, stack_runs
-from imu_calibration.papers.zhang2017_joint_fit import arm_errors, fit_joint, fit_triad, jacobian, judge_design, predict, weak_arms
+from imu_calibration.papers.zhang2017_joint_fit import (
+    DESIGNS,
+    arm_errors,
+    design_runs,
+    face,
+    fit_joint,
+    fit_triad,
+    jacobian,
+    judge_design,
+    oscillation,
+    predict,
+    skewed_axes,
+    spin,
+    stack_runs,
+    weak_arms,
+)
 
 G = STANDARD_GRAVITY
 MG = 1e-3 * G

@@ -1,4 +1,4 @@
-"""The noise figures of an IMU, and the parameters of filters from them."""
+"""The noise figures of an IMU, and the parameters of filters from them: discrete noise, and Gauss-Markov processes for the slow part."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -7,6 +7,8 @@ import numpy as np
 
 from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, NoiseProcess, allan_variance, gauss_markov
 from imu_calibration.allan.terms import TIME, Term
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.noise_model import BiasProcess
 
 HORIZON = 100.0
 """s; for a filter with white noise and a random walk only: the walk has the same Allan variance at this averaging time."""
@@ -145,3 +147,30 @@ class Densities:
     def step_sd(self, rate: float) -> float:
         """Return the standard deviation by which the bias steps from one sample to the next at a rate (Hz)."""
         return self.walk / float(np.sqrt(rate))
+
+
+RATIO = 4.0
+"""Of neighbouring times: the density ripples by a hundredth."""
+TIMES = RATIO ** np.arange(1, 8)
+"""s: from the length of windows to four times that of sessions of an hour."""
+
+
+def bias_processes(figures: NoiseFigures) -> dict[str, tuple[BiasProcess, ...]]:
+    """
+    Return sensor -> its bias processes, from the mean of the axes' variances; empty for a sensor without slow noise.
+
+    Figures that are held do not enter: a bound is no measurement.
+    """
+    return {sensor: _processes([{p.name: (p, c) for p, c in axis.processes()} for axis in figures.sensor(sensor)]) for sensor in SENSORS}
+
+
+def _processes(axes):
+    share = 1.0 / len(axes)
+    flicker, walk = (share * sum(axis[name][1] for axis in axes if name in axis) for name in (FLICKER.name, RANDOM_WALK.name))
+    variances = {time: flicker * np.log(RATIO) / np.pi for time in TIMES}
+    variances[TIMES[-1]] += walk * TIMES[-1] / 2.0
+    for axis in axes:
+        if 'gauss_markov' in axis:
+            process, coefficient = axis['gauss_markov']
+            variances[process.time] = variances.get(process.time, 0.0) + share * coefficient
+    return tuple(BiasProcess(float(np.sqrt(variance)), float(time)) for time, variance in sorted(variances.items()) if variance > 0)

@@ -7,20 +7,144 @@ import numpy as np
 
 from imu_calibration import __version__
 from imu_calibration.allan.curve import AllanCurve, Detrending, RestReader
+from imu_calibration.allan.deviation import averaging_factors
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures, TrendFigure
 from imu_calibration.allan.forms import PROCESSES
-from imu_calibration.allan.moment_fit import Moments
-from imu_calibration.allan.processes import RANDOM_WALK, WHITE
-from imu_calibration.allan.recording_time import RecordingTimes
+from imu_calibration.allan.moment_fit import Moments, Whitener
+from imu_calibration.allan.processes import RANDOM_WALK, WHITE, NoiseProcess
 from imu_calibration.allan.scale_covariance import ScaleCovariance
-from imu_calibration.allan.still_parts import LeftOut, StillPart, still_parts
-from imu_calibration.allan.survey import Survey, survey
+from imu_calibration.allan.still_parts import LeftOut, StillPart, Survey, still_parts, survey
 from imu_calibration.allan.terms import DETERMINED, LEAST_SCALES, AxisNoise, identify_axis
-from imu_calibration.allan.tones import ToneSearch
 from imu_calibration.allan.trends import MOST_BLOCKS, AxisTrend, Blocks, TrendSearch
+from imu_calibration.chances import f_sf
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.errors import InputError
 from imu_calibration.samples import NominalScaling, SampleBlock
+
+CYCLES = 64
+"""Cycles of the hump's frequency in a segment: a resonance of quality below 16 is wider than the neighbouring ordinates of the test."""
+FEWEST_CYCLES = 16
+"""Cycles in the longest rest, at least: with fewer, slow noise and a line are not separable."""
+PER_CYCLE = 16
+"""Block means per cycle: twice the hump's frequency, the highest under test, has eight."""
+LOBE, NEIGHBOURS = 2, 9
+"""Half width of a line under a Hann window, and distance of the farthest neighbouring ordinates, in bins."""
+INDEPENDENT = 2 / 3
+"""Share of independent ordinates under a Hann window, whose noise bandwidth is 1.5 bins."""
+SIGNIFICANT = 1e-4
+"""Significance level over all frequencies under test: six axes of 100 recordings without a line give 0.06 false ones."""
+
+
+class ToneSearch:
+    """
+    Search for a line between half and twice the frequency of a hump in one axis, block by block, at constant memory.
+
+    Parameters
+    ----------
+    frequency : float
+        Frequency of the hump, Hz.
+    period : float
+        Time between samples, s.
+    column : int
+        Axis: force x, y, z, then rate x, y, z.
+    longest : float
+        Duration of the longest rest, s.
+
+    """
+
+    def __init__(self, frequency: float, period: float, column: int, *, longest: float):
+        self._frequency, self._column = frequency, column
+        self._block = max(int(1 / (PER_CYCLE * frequency * period)), 1)
+        self._step = self._block * period
+        self._size = int(min(CYCLES / frequency, longest) / self._step) if longest * frequency >= FEWEST_CYCLES else 0
+        self._power, self._count, self._samples = np.zeros(self._size // 2 + 1), 0, np.zeros(0)
+
+    def push(self, values: np.ndarray, present: np.ndarray) -> None:
+        """Add the next samples of a rest, shape (n, 6); missing ones are replaced by the mean."""
+        from scipy.signal import periodogram  # here, because its import is slow
+
+        if not self._size or not present.any():
+            return
+        self._samples = np.concatenate([self._samples, np.where(present, values[:, self._column], values[present, self._column].mean())])
+        length = self._block * self._size
+        while len(self._samples) >= length:
+            segment, self._samples = self._samples[:length].reshape(self._size, self._block).mean(axis=1), self._samples[length:]
+            self._power += periodogram(segment, window='hann', detrend='linear', scaling='spectrum')[1]
+            self._count += 1
+
+    def end_stretch(self) -> None:
+        """Discard the incomplete segment: the next sample belongs to another rest."""
+        self._samples = np.zeros(0)
+
+    def line(self) -> tuple[float, float] | None:
+        """Return (frequency in Hz, amplitude) of the most significant line, None without a significant one."""
+        bins = np.arange(NEIGHBOURS, len(self._power) - NEIGHBOURS)
+        hertz = 1 / (max(self._size, 1) * self._step)
+        bins = bins[(bins * hertz >= 0.5 * self._frequency) & (bins * hertz <= 2 * self._frequency)]
+        if not self._count or not len(bins):
+            return None
+        offsets = np.r_[-NEIGHBOURS:-LOBE, LOBE + 1:NEIGHBOURS + 1]
+        around = self._power[bins[:, None] + offsets].mean(axis=1)
+        ratio = self._power[bins] / around
+        best = int(np.argmax(ratio))
+        if not f_sf(ratio[best], 2 * self._count, 2 * self._count * len(offsets) * INDEPENDENT) * len(bins) < SIGNIFICANT:
+            return None
+        lobe = np.arange(bins[best] - LOBE, bins[best] + LOBE + 1)
+        power = self._power[lobe]
+        place = float(power @ lobe / power.sum()) * hertz
+        square = max(power.sum() - len(lobe) * around[best], 0.0) / self._count * 2 * INDEPENDENT
+        return place, float(np.sqrt(square) / np.sinc(place * self._step))
+
+
+LENGTHS = 60.0 * np.array([10, 15, 20, 30, 45, 60, 90, 120, 180, 240, 360, 480, 720, 1080, 1440, 2160, 2880], float)
+"""Recordings that are thought of, s: from ten minutes to two days."""
+RELATIVE_SD = 0.24
+"""Standard deviation of a coefficient over the coefficient at which the 95 % interval of its root has a ratio of 1.6."""
+SCALES_FROM = 0.1
+"""s; shorter averaging times determine the white noise only, at any length of recording."""
+
+
+class RecordingTimes:
+    """
+    Predicts relative standard deviations of coefficients.
+
+    Parameters
+    ----------
+    period : float
+        Time between samples, s.
+
+    """
+
+    def __init__(self, period: float):
+        self._period = period
+        self._scales: dict[float, ScaleCovariance] = {}
+
+    def needed(self, processes: tuple[NoiseProcess, ...], coefficients: np.ndarray, index: int) -> float | None:
+        """Return the shortest of `LENGTHS` in which coefficient `index` of a model is determined, s; None when none is long enough."""
+        for length in LENGTHS:
+            if self.relative_sd(length, processes, coefficients, index=index) <= RELATIVE_SD:
+                return float(length)
+        return None
+
+    def relative_sd(self, seconds: float, processes: tuple[NoiseProcess, ...], coefficients: np.ndarray, *, index: int) -> float:
+        """Return the standard deviation of a coefficient over the coefficient, from one recording at rest of this length."""
+        moments = self._moments(seconds)
+        design, tensor = moments.design(processes), moments.tensor(processes)
+        columns = Whitener(np.einsum('p,q,pqij->ij', coefficients, coefficients, tensor))(design * coefficients)
+        information = columns.T @ columns
+        size = np.sqrt(np.diag(information))
+        inverse = np.linalg.pinv(information / np.outer(size, size), rcond=1e-12, hermitian=True)
+        return float(np.sqrt(inverse[index, index]) / size[index])
+
+    def _moments(self, seconds):
+        if seconds not in self._scales:
+            n = int(seconds / self._period)
+            factors = averaging_factors(n, per_octave=1)
+            factors = factors[factors * self._period >= SCALES_FROM]
+            self._scales[seconds] = ScaleCovariance(factors, [n], self._period)
+        scales = self._scales[seconds]
+        return Moments(scales, np.ones(len(scales.factors)), np.ones(len(scales.factors), bool))
+
 
 LEAST_SAMPLES = 1000
 """Least number of samples at rest for a curve."""

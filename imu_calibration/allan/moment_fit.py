@@ -12,10 +12,9 @@ from itertools import combinations
 
 import numpy as np
 
-from imu_calibration.allan.between_parts import Parts
 from imu_calibration.allan.processes import NoiseProcess, gauss_markov
 from imu_calibration.allan.scale_covariance import ScaleCovariance
-from imu_calibration.allan.trends import KeptShare
+from imu_calibration.allan.trends import KeptShare, Parts
 
 STEPS = 25
 """Rounds of weights and coefficients at most."""

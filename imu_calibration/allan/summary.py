@@ -1,16 +1,66 @@
-"""The noise figures as sentences and rows: for the terminal and the report."""
+"""The noise figures as sentences and rows, for the terminal and the report; and the position error of dead reckoning that they cause."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.allan.dead_reckoning import position_budget
 from imu_calibration.allan.document import TERMS, UNITS
 from imu_calibration.allan.figures import HORIZON, SLOW, AxisFigures, NoiseFigures
-from imu_calibration.allan.processes import RANDOM_WALK, WHITE
+from imu_calibration.allan.processes import RANDOM_WALK, WHITE, NoiseProcess, mean_covariance
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, WEAK, Term
+from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
 from imu_calibration.units import NOISE, for_people, significant
+
+FINEST, MOST_BLOCKS = 150, 1000
+"""Blocks of the run at most, and of alignment and run together."""
+RUNS = (1.0, 10.0, 60.0, 600.0)
+"""Lengths of dead reckoning, s."""
+
+
+def position_budget(figures: NoiseFigures) -> list[tuple[float, dict[str, float]]]:
+    """Return the standard deviation of the position along one horizontal axis after each of `RUNS`, m, by sensor, of the worst axes."""
+    return [(seconds, {sensor: max(_of_axis(axis, sensor, seconds) for axis in figures.sensor(sensor)) for sensor in SENSORS})
+            for seconds in RUNS]
+
+
+def _of_axis(axis: AxisFigures, sensor: str, seconds: float) -> float:
+    processes = axis.processes()
+    shares = position_sd([process for process, _ in processes], [coefficient for _, coefficient in processes], sensor, seconds=seconds)
+    return float(np.sqrt((shares**2).sum()))
+
+
+def position_sd(processes: Sequence[NoiseProcess], coefficients: Sequence[float], sensor: str, *, seconds: float,
+                alignment: float = 60.0, gravity: float = STANDARD_GRAVITY) -> np.ndarray:
+    """
+    Return the standard deviation of the position by each process of one axis, m, shape (n_processes,).
+
+    Parameters
+    ----------
+    processes : sequence of NoiseProcess
+    coefficients : sequence of float
+        Squares of the figures.
+    sensor : str
+        'accelerometer' or 'gyroscope'.
+    seconds : float
+        Length of the run.
+    alignment : float
+        Time at rest before it, over which the bias is averaged, s.
+    gravity : float
+        m/s^2.
+
+    """
+    after = int(np.ceil(min(FINEST, MOST_BLOCKS * seconds / (seconds + alignment))))
+    step = seconds / after
+    before = max(round(alignment / step), 1)
+    until_end = (after - np.arange(after) - 0.5) * step
+    weights = until_end * step if sensor == 'accelerometer' else 0.5 * gravity * until_end**2 * step
+    weights = np.concatenate([np.full(before, -weights.sum() / before), weights])
+    lag = (np.arange(before + after)[:, None] - np.arange(before + after)[None, :]) * step
+    variances = [weights @ mean_covariance(process, lag, step) @ weights for process in processes]
+    return np.sqrt(np.maximum(np.array(variances), 0.0) * np.asarray(coefficients, float))
+
 
 TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bias_instability': 'bias instability B',
           'gauss_markov': 'Gauss–Markov σ', TIME: 'correlation time τ', 'random_walk': 'random walk K',

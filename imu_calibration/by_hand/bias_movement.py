@@ -9,7 +9,7 @@ from scipy.special import fdtrc
 from imu_calibration.by_hand.equations import Poses
 from imu_calibration.by_hand.model import ACCELEROMETER, GYRO_BIAS, HandModel
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
-from imu_calibration.preflight.finding import WARNING, CheckFinding
+from imu_calibration.preflight.evidence import WARNING, CheckFinding
 
 P_VALUE = 1e-3
 """A drift is significant below this p-value."""

@@ -11,7 +11,7 @@ from imu_calibration.calibration.check import CheckResult
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.proof import compared
-from imu_calibration.compensation.arrays import compensate_readings
+from imu_calibration.compensation.stream import compensate_readings
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import UNIT
 from imu_calibration.errors import NotObservableError

@@ -28,7 +28,7 @@ from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.stamping import StampLine
 from imu_calibration.segmentation.stream_cleaning import StreamCheck
-from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.segmentation.window import WindowSettings
 
 SEARCH_SHARE = 0.05
 """Largest share of time for the search for rest: after an hour at 200 Hz a search runs every ten seconds or so."""

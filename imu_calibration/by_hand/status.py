@@ -17,7 +17,7 @@ from imu_calibration.calibration.verdict import SCALES
 from imu_calibration.errors import with_hint
 from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.static_detector import find_still
-from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.segmentation.window import WindowSettings
 
 FACES = {f'{sign}{axis}': direction for axis, unit in zip('xyz', np.eye(3)) for sign, direction in (('+', unit), ('-', -unit))}
 """The six directions that can be turned up."""

@@ -23,7 +23,7 @@ from imu_calibration.effects.applied import centred
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError
 from imu_calibration.preflight.checks import Preflight
-from imu_calibration.preflight.finding import CheckFinding
+from imu_calibration.preflight.evidence import CheckFinding
 from imu_calibration.preflight.joint_checks import check_force
 from imu_calibration.samples import ImuSamples, NominalScaling, SampleBlock, TemperatureSamples
 from imu_calibration.segmentation.block_cleaning import BlockCleaner, Watcher

@@ -14,9 +14,8 @@ from imu_calibration.preflight.checks import Preflight
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import NominalScaling, SampleBlock
 from imu_calibration.segmentation.block_cleaning import Watcher
-from imu_calibration.segmentation.window import Window
+from imu_calibration.segmentation.window import Window, WindowSettings
 from imu_calibration.segmentation.window_finder import MotionGatherer
-from imu_calibration.segmentation.window_settings import WindowSettings
 
 
 class Collector:

@@ -155,7 +155,7 @@ class Calibration:
             Corrected specific force and rate, of the same type as the input; NaN where a reading cannot be corrected.
 
         """
-        from imu_calibration.compensation.arrays import compensate_readings
+        from imu_calibration.compensation.stream import compensate_readings
         return compensate_readings(self, samples, rate_s, time=time, temperature_c=temperature_c)
 
     def __repr__(self):

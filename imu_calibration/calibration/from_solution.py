@@ -23,7 +23,7 @@ from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.standard_motions import Motion, motions_about
 from imu_calibration.preflight.checks import unusable, warnings
-from imu_calibration.preflight.finding import CheckFinding
+from imu_calibration.preflight.evidence import CheckFinding
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window_cutter import dropped
 

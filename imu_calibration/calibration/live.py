@@ -27,8 +27,7 @@ from imu_calibration.estimation.window_store import WindowStore
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.stamping import StampLine
-from imu_calibration.segmentation.window import Window
-from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.segmentation.window import Window, WindowSettings
 
 HELD_BACK = 200
 """Blocks that wait for the first temperature at most, when a thermal effect needs one."""

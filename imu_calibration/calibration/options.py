@@ -4,8 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from imu_calibration.allan.bias_processes import bias_processes
-from imu_calibration.allan.figures import NoiseFigures
+from imu_calibration.allan.figures import NoiseFigures, bias_processes
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.named_models import DEFAULT, parse_effects, parse_reference, with_common_arm
@@ -13,7 +12,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import NominalScaling
-from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.segmentation.window import WindowSettings
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.stamping import StampLine
-from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.segmentation.window import WindowSettings
 
 
 @dataclass(frozen=True)

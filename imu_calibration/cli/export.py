@@ -47,8 +47,7 @@ def run(options: Namespace) -> VerbResult:
 
 def _show_targets():
     from imu_calibration.cli.show import console, show_table
-    from imu_calibration.exports.export import holds_in_words
-    from imu_calibration.exports.registry import all_targets
+    from imu_calibration.exports.export import all_targets, holds_in_words
     rows = [(target.name, target.title, holds_in_words(target), target.noise_is or '-', 'yes' if target.read else '-')
             for target in all_targets().values() if target.write is not None]
     show_table(console(), ('name', 'file', 'of the calibration it holds', 'noise', 'read'), rows)

@@ -47,7 +47,7 @@ def run(options: Namespace) -> VerbResult:
         return _run_by_hand(options)
     stand = _stand(options)
     from imu_calibration import files
-    from imu_calibration.planning.document import plan_to_mapping
+    from imu_calibration.planning.planner import plan_to_mapping
     from imu_calibration.progress import report
     from imu_calibration.use_cases.plan import plan
     with files.output_folder(options.output) as folder:
@@ -85,7 +85,7 @@ def _pose(text):
 
 
 def _stand(options):
-    from imu_calibration.planning.yaw_only import yaw_table
+    from imu_calibration.planning.repertoire import yaw_table
     if options.motion == 'yaw-only':
         return yaw_table(options.gravity)
     stand = stand_of(options)

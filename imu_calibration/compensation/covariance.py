@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.compensation.angular_acceleration import CausalDerivative
-from imu_calibration.compensation.compensate import Transfer, invertible_values
-from imu_calibration.compensation.fitted import FittedErrors
+from imu_calibration.compensation.compensate import FittedErrors, Transfer, invertible_values
 from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.rate_slope import SlopeError
 from imu_calibration.effects.base import SENSORS, Role

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.compensation.fitted import FittedErrors
+from imu_calibration.compensation.compensate import FittedErrors
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.navigation import drift_over
@@ -13,8 +13,8 @@ from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.reference_motion import Reference
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.segmentation.window import WindowSettings
 from imu_calibration.segmentation.window_finder import MotionGatherer
-from imu_calibration.segmentation.window_settings import WindowSettings
 
 
 @dataclass(frozen=True, eq=False)

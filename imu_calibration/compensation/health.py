@@ -6,13 +6,93 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imu_calibration.compensation.bias_update import EARTH_RATE, MOST_MOVED, GyroBiasUpdate
-from imu_calibration.compensation.compensate import Transfer
+from imu_calibration.compensation.compensate import FittedErrors, Transfer
 from imu_calibration.compensation.covariance import Uncertainty
-from imu_calibration.compensation.fitted import FittedErrors
-from imu_calibration.compensation.stops import Stop
+from imu_calibration.compensation.stops import BLOCK, Stop, StopDetector
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.units import unit_of_rest
+
+EARTH_RATE = 7.292e-5
+"""rad/s; a gyroscope at rest measures it about axes that are unknown here."""
+MOST_MOVED = 0.02
+"""rad/s, 1.1 deg/s: a calibrated bias that has moved farther is a slow turn, or a broken sensor."""
+
+
+class GyroBiasUpdate:
+    """
+    The residual bias after compensation, a Gauss-Markov process that every stop measures.
+
+    Between stops ``b <- phi b, P <- phi^2 P + (1 - phi^2) S^2`` with ``phi = exp(-dt / time)``; at a stop the Kalman update with the mean
+    of the corrected rate. Without stops the update decays and its uncertainty returns to S: that of the calibration, or that of the stops
+    if it is larger.
+
+    Parameters
+    ----------
+    prior_sd : ndarray, shape (3,)
+        Standard deviation of the bias in the calibration, rad/s.
+    time : float
+        Seconds in which an update loses its meaning.
+
+    """
+
+    def __init__(self, prior_sd: np.ndarray, time: float):
+        prior = np.asarray(prior_sd, float)**2
+        self._time, self._stop, self.n_stops = time, float('nan'), 0
+        self._now = self._before = _State(np.zeros(3), prior, prior, np.zeros(3))
+
+    def predict(self, now: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return (bias, its variance) at `now`, s; rad/s and its square, each shape (3,)."""
+        return self._now.after(now, self._time)[:2]
+
+    def measure(self, start: float, now: float, *, rate: np.ndarray, variance: np.ndarray) -> bool:
+        """
+        Process the mean of the corrected rate over a stop until now; as the stop grows, the longer mean replaces the shorter one.
+
+        Parameters
+        ----------
+        start, now : float
+            Start of the stop, which identifies it, and the end of the mean, s.
+        rate : ndarray, shape (3,)
+            Without any update, rad/s.
+        variance : ndarray, shape (3,)
+            Of that mean; the Earth's rate is added here.
+
+        Returns
+        -------
+        bool
+            Whether it was accepted: a mean beyond any change of bias is a slow rotation.
+
+        """
+        if np.linalg.norm(rate) > MOST_MOVED:
+            return False
+        if start != self._stop:
+            self._stop, self._before, self.n_stops = start, self._now, self.n_stops + 1
+        variance = variance + EARTH_RATE**2 / 3
+        bias, spread, seen, weight = self._before.after(now, self._time)
+        seen, weight = seen + rate**2, weight + 1
+        stationary = np.maximum(self._before.stationary, seen / weight)
+        spread = spread + np.maximum(stationary - self._before.stationary, 0)   # it has been as wide before anybody saw it
+        gain = spread / (spread + variance)
+        self._now = _State(bias + gain * (rate - bias), (1 - gain) * spread, stationary, seen, weight, now)
+        return True
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    bias: np.ndarray
+    variance: np.ndarray
+    stationary: np.ndarray
+    """Variance without stops."""
+    seen: np.ndarray
+    """Sum of squares of the updates, with decreasing weight of older stops."""
+    weight: float = 0.0
+    at: float = 0.0
+
+    def after(self, now, time):
+        """Return (bias, variance, seen, weight) at `now`."""
+        phi = np.exp(-max(now - self.at, 0.0) / time) if self.weight else 0.0
+        return phi * self.bias, phi**2 * self.variance + (1 - phi**2) * self.stationary, phi * self.seen, phi * self.weight
+
 
 LIMIT = 4.0
 """Standard deviations; three axes exceed it by chance once in five thousand calibrations."""
@@ -169,3 +249,58 @@ class CalibrationHealth:
         if bias_update is not None and force_off <= LIMIT:
             return HealthState(FOLLOWED, '; '.join(lines) + ': corrected as long as stops confirm it', values)
         return HealthState(MOVED, '; '.join(lines) + ': calibrate again, unless it turned slowly and steadily there', values)
+
+
+SIX = tuple[float, ...]
+AS_STOPS = [0, 4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
+"""Columns of a sample for the detection of stops: time, force, rate, measured force, measured rate."""
+
+
+class StopWatch:
+    """
+    Follows a `CalibrationHealth` sample by sample; between two evaluations it costs an append.
+
+    Parameters
+    ----------
+    health : CalibrationHealth
+
+    """
+
+    def __init__(self, health: CalibrationHealth):
+        self.health, self._detector = health, StopDetector(health.noise_sd)
+        self._waiting: list[SIX] = []
+        self._first_ns = self._look = 0
+        self._offset: tuple[float, float, float] | None = None
+
+    def follow(self, stamp_ns: int, measured: SIX, corrected: SIX) -> SIX:
+        """Process a sample (rate x, y, z, force x, y, z; measured and corrected); return the corrected one minus the bias update."""
+        since = stamp_ns - self._first_ns
+        self._waiting.append((since, *corrected, *measured))
+        if since >= self._look or since < 0:
+            self._take(stamp_ns)
+        if self._offset is None:
+            return corrected
+        bx, by, bz = self._offset
+        return (corrected[0] - bx, corrected[1] - by, corrected[2] - bz, *corrected[3:])
+
+    @property
+    def rate_cov(self) -> np.ndarray:
+        """Covariance of the correction of the rate, shape (3, 3)."""
+        if self._offset is None or self.health.update is None:
+            return np.zeros((3, 3))
+        return np.diag(self.health.update.predict(self._look * 1e-9)[1])
+
+    def _take(self, stamp_ns):
+        if stamp_ns < self._first_ns or not self._first_ns:   # the beginning, or a clock set back
+            self._first_ns, self._look, self._waiting, self._detector = stamp_ns, 0, [], StopDetector(self.health.noise_sd)
+            return
+        samples = np.array(self._waiting)
+        since = int(samples[-1, 0])
+        self._waiting, self._look = [], since + round(1e9 * BLOCK)
+        rows = samples[:, AS_STOPS]
+        rows[:, 0] *= 1e-9
+        stop = self._detector.push(rows)
+        if stop is not None:
+            self.health.judge(stop)
+        if self.health.update is not None and self.health.update.n_stops:
+            self._offset = tuple(self.health.update.predict(since * 1e-9)[0].tolist())

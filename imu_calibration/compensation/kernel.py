@@ -11,8 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from imu_calibration.compensation.compensate import CONVERGED, ITERATIONS, Transfer, invertible_values
-from imu_calibration.compensation.fitted import FittedErrors
+from imu_calibration.compensation.compensate import CONVERGED, ITERATIONS, FittedErrors, Transfer, invertible_values
 from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.effects.expressions import SCALAR_FUNCTIONS, added, as_text, scaled
 from imu_calibration.effects.forward_equations import coefficients_at_point

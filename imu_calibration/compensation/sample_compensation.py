@@ -6,15 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.compensation.compensate import Transfer, invertible, saturation_level
+from imu_calibration.compensation.compensate import FittedErrors, Transfer, invertible, saturation_level
 from imu_calibration.compensation.covariance import Uncertainty, is_known
-from imu_calibration.compensation.fitted import FittedErrors
 from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.rate_slope import NO_SLOPE, RateSlope
 from imu_calibration.compensation.stream import derivative_for, uses_slope
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.reference.thermal_branch import ThermalBranch
-from imu_calibration.reference.vibration import BandVariance
+from imu_calibration.reference.signal_history import BandVariance, ThermalBranch
 
 
 class SampleCompensation:

@@ -14,7 +14,7 @@ from imu_calibration.navigation import drift_over
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window, all_samples, chunks
 from imu_calibration.selection.saturation import measured
-from imu_calibration.simulation.replay import predict_windows
+from imu_calibration.simulation.session import predict_windows
 
 BLOCK = 0.25
 """Residuals are averaged over this time for plots, s."""

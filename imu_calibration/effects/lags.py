@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS, SHORT, Effect
-from imu_calibration.reference.joint_delay import shifted
-from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.joint_motion import JointMotion, shifted
 from imu_calibration.reference.table import Table
 
 FIRST_ORDER = tuple(zip(*reversed(np.polynomial.laguerre.laggauss(5))))

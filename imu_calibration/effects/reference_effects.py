@@ -11,9 +11,8 @@ from imu_calibration.effects.base import MATRIX, Effect, Role
 from imu_calibration.effects.lags import LAGS
 from imu_calibration.effects.regressors import ATTITUDE, LOAD, PAIRS
 from imu_calibration.reference.axis_angles import with_axis_angles, with_axis_places
-from imu_calibration.reference.encoder import with_encoder_harmonics
 from imu_calibration.reference.joint import JointNames
-from imu_calibration.reference.joint_delay import shifted
+from imu_calibration.reference.joint_motion import shifted, with_encoder_harmonics
 from imu_calibration.reference.leaning_axes import WOBBLES, with_sag, with_wobble
 from imu_calibration.reference.levelling import tilt
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.reference.reference_motion import Reference
-from imu_calibration.reference.thermal_branch import ThermalBranch
+from imu_calibration.reference.signal_history import ThermalBranch
 
 REST, WAY = 5.0, 3.0
 """s; a rest, and the time from one rest to the next."""

@@ -2,6 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from pkgutil import iter_modules
 
 import numpy as np
 
@@ -11,12 +14,10 @@ from imu_calibration.allan.summary import BASIS
 from imu_calibration.calibration.document import Calibration, to_mapping
 from imu_calibration.calibration.trust import Usable, caveats, usable
 from imu_calibration.effects.base import SENSORS, UNIT, Role
-from imu_calibration.errors import InputError
-from imu_calibration.exports.affine import AffineImu, Placement, affine_of, moved
-from imu_calibration.exports.holdings import ARMS, MATRICES
-from imu_calibration.exports.loss import NOTHING, Loss, loss_of
-from imu_calibration.exports.motion import TrialMotion, standard_motion
-from imu_calibration.exports.pose import UNNAMED, pose_line
+from imu_calibration.errors import InputError, did_you_mean
+from imu_calibration.exports import targets
+from imu_calibration.exports.affine import ARMS, MATRICES, UNNAMED, AffineImu, Placement, affine_of, moved, pose_line
+from imu_calibration.exports.loss import NOTHING, Loss, TrialMotion, loss_of, standard_motion
 from imu_calibration.exports.target import Noise, Numbers, Page, Readings, Target
 from imu_calibration.units import significant
 
@@ -208,3 +209,45 @@ def holds_in_words(target: Target) -> str:
             name = name.removeprefix('accel ' if sensor == SENSORS[0] else 'gyro ')
         parts.setdefault(name, []).append(holding.sensor)
     return ', '.join(name if len(sensors) == 2 else f'{name} ({sensors[0]})' for name, sensors in parts.items()) or '-'
+
+
+@cache
+def all_targets() -> dict[str, Target]:
+    """Return every target by name, in alphabetical order."""
+    modules = [import_module(f'{targets.__name__}.{found.name}') for found in iter_modules(targets.__path__)]
+    return {target.name: target for target in sorted((t for module in modules for t in module.TARGETS), key=lambda t: t.name)}
+
+
+def find_target(name: str) -> Target:
+    """
+    Return the target of a name.
+
+    Raises
+    ------
+    InputError
+        When there is none.
+
+    """
+    return _find(name, [target for target in all_targets().values() if target.write is not None], 'written')
+
+
+def find_reader(name: str) -> Target:
+    """
+    Return the target of a name; its files must be readable.
+
+    Raises
+    ------
+    InputError
+        When there is none.
+
+    """
+    return _find(name, [target for target in all_targets().values() if target.read is not None], 'read')
+
+
+def _find(name: str, fitting: list[Target], what: str) -> Target:
+    for target in fitting:
+        if target.name == name:
+            return target
+    raise InputError(f"the name of a program whose files can be {what} is required, got '{name}'"
+                     f"{did_you_mean(name, (target.name for target in fitting))}; choose from "
+                     f"{', '.join(target.name for target in fitting)}")

@@ -11,9 +11,7 @@ from imu_calibration.calibration.document_checks import check_numbers
 from imu_calibration.calibration.status import HELD, WEAK
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.exports.affine import AffineImu, moved
-from imu_calibration.exports.holdings import MATRICES, OFFSETS, Holding, holding_of
-from imu_calibration.exports.pose import find_pose
+from imu_calibration.exports.affine import MATRICES, OFFSETS, AffineImu, Holding, find_pose, holding_of, moved
 from imu_calibration.exports.target import Read, Target
 
 

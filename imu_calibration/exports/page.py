@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from imu_calibration.exports.export import holds_in_words
-from imu_calibration.exports.registry import all_targets
+from imu_calibration.exports.export import all_targets, holds_in_words
 from imu_calibration.exports.target import Target
 
 HEAD = """\

@@ -8,9 +8,7 @@ import numpy as np
 
 from imu_calibration.allan.figures import Densities
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.exports.affine import AffineImu, Placement
-from imu_calibration.exports.gauges import as_mounted
-from imu_calibration.exports.holdings import Holding
+from imu_calibration.exports.affine import AffineImu, Holding, Placement, as_mounted
 
 Numbers = dict[str, Any]
 """Name in the file -> number, list or mapping, in the units of the program."""

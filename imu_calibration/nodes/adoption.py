@@ -8,8 +8,7 @@ from imu_calibration.calibration.comparison import moved_beyond_sd
 from imu_calibration.calibration.document import Calibration, calibration_from_text
 from imu_calibration.calibration.measured_noise import with_measured_noise
 from imu_calibration.compensation.compensate import Transfer
-from imu_calibration.compensation.health import CalibrationHealth, HealthOptions
-from imu_calibration.compensation.stop_watch import StopWatch
+from imu_calibration.compensation.health import CalibrationHealth, HealthOptions, StopWatch
 from imu_calibration.compensation.stream import requested_transfer
 from imu_calibration.documents import version_of
 from imu_calibration.errors import DocumentError, ImuCalibrationError, shortened

@@ -43,7 +43,7 @@ from imu_calibration.nodes.session_reference import reference_of
 from imu_calibration.nodes.topics import announce
 from imu_calibration.nodes.worker_requests import Listeners
 from imu_calibration.resources import config_file
-from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.segmentation.window import WindowSettings
 from imu_calibration.settings import setting
 from imu_calibration.use_cases.provenance import provenance_with
 from msg_adapters.encode import encode_imu, rows

@@ -24,7 +24,7 @@ from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
 from imu_calibration.nodes.session_files import SessionFiles
 from imu_calibration.nodes.worker_requests import Listeners, Request
 from imu_calibration.preflight.stream_watch import StreamWatch
-from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.segmentation.window import WindowSettings
 from msg_adapters.live import LiveGatherer
 
 PERIOD = 0.1

@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from imu_calibration.compensation.compensate import Transfer
+from imu_calibration.compensation.compensate import FittedErrors, Transfer
 from imu_calibration.compensation.covariance import is_known
-from imu_calibration.compensation.fitted import FittedErrors
+from imu_calibration.compensation.health import StopWatch
 from imu_calibration.compensation.sample_compensation import SampleCompensation
-from imu_calibration.compensation.stop_watch import StopWatch
 from imu_calibration.compensation.stream import late_ns
 from msg_adapters.imu_stream import ImuStream
 from msg_adapters.stamps import MessageError

@@ -26,9 +26,8 @@ from visualization_msgs.msg import MarkerArray
 from imu_calibration import files
 from imu_calibration.calibration.document import Calibration, calibration_from_text
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.driving.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect
+from imu_calibration.driving.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect, separator_of
 from imu_calibration.driving.driver import Driver, DriverSettings
-from imu_calibration.driving.separating import separator_of
 from imu_calibration.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import driven_markers
@@ -47,9 +46,9 @@ from imu_calibration.nodes.qos import latched_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.nodes.timers import every
 from imu_calibration.nodes.topics import announce
-from imu_calibration.planning.noise import expected_noise, require_grade
-from imu_calibration.planning.places import up_at
 from imu_calibration.planning.planner import make_planner
+from imu_calibration.planning.repertoire import up_at
+from imu_calibration.planning.situation import expected_noise, require_grade
 from imu_calibration.reference.motion_limits import NOT_CHECKED, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.resources import config_file

@@ -38,10 +38,9 @@ from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file
 from imu_calibration.settings import setting
-from imu_calibration.simulation.hidden_causes import CAUSES, hidden_causes
 from imu_calibration.simulation.live import LiveSimulation
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.simulation.sensor_noise import CAUSES, GRADES, hidden_causes
 from imu_calibration.simulation.session import SimulationOptions, random_values
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 from msg_adapters.encode import encode_imu, encode_joints, encode_temperature, rows

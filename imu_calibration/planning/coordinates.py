@@ -1,18 +1,21 @@
-"""Parameters in units of their tolerances, without the directions that a gauge fixes."""
+"""Parameters in units of their tolerances, and goals of a plan as a number: every tolerance met, or causes separated."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import scipy.linalg
 
+from imu_calibration.chances import chi2_isf, norm_ppf
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import all_arms, coefficient_jacobian
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.prior import fixed_parameters, make_prior
+from imu_calibration.selection.search import FAMILY_WISE, TIE
 
 EXACT = 1e-4
 """A parameter counts as known if its sd is below this share of its tolerance."""
@@ -102,3 +105,128 @@ def _basis(gauge):
     basis[free, np.arange(len(free))] = 1.0
     basis[np.ix_(concerned, len(free) + np.arange(inner.shape[1]))] = inner
     return basis
+
+
+POWER = 0.95
+"""Probability with which causes are to be separated."""
+
+
+class Goal(Protocol):
+    """Requirement on the covariance of z."""
+
+    words: str
+    """The causes to be separated, if that is the goal."""
+
+    def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
+        """Return the distance of covariances, shape (k, n, n), with roots enlarged by `margin`, from the goal, shape (k,); zero at it."""
+
+    def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
+        """Return the names of unmet requirements with one covariance, shape (n, n)."""
+
+
+class WithinTolerances:
+    """Every requested parameter within its tolerance: ``sum_i w_i max(0, ln(sd_i / tolerance_i))``, all weights 1 unless given."""
+
+    words = ''
+
+    def __init__(self, coordinates: Coordinates, weights: np.ndarray | float = 1.0):
+        self.coordinates, self.weights = coordinates, weights
+
+    def excess(self, covariance: np.ndarray) -> np.ndarray:
+        """Return standard deviations of the requested parameters, in tolerances, shape (k, p)."""
+        asked = self.coordinates.asked
+        return np.sqrt(np.maximum(np.einsum('pn,knm,pm->kp', asked, covariance, asked, optimize=True), 1e-300))
+
+    def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
+        """Return the weighted sum of the logarithms of the excess."""
+        return (self.weights * np.maximum(np.log(margin * self.excess(covariance)), 0.0)).sum(axis=1)
+
+    def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
+        """Return the parameters outside their tolerance."""
+        names = np.array(self.coordinates.model.param_names)[self.coordinates.wanted]
+        return tuple(names[self.excess(covariance[None])[0] > 1.0 + 1e-6].tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """One effect of a class that is collinear in a recording."""
+
+    key: tuple[str, str]
+    """(sensor, effect name)."""
+    places: np.ndarray
+    """Its coordinates."""
+    size: np.ndarray
+    """Its assumed size, in those coordinates."""
+
+
+class ToldApart:
+    """
+    Each cause of a class with its assumed size, with another member of the class in the model instead.
+
+    The noncentrality of cause a with cause b is ``lambda = theta_a' [M_aa - M_ar M_rr^-1 M_ra] theta_a`` with r the baseline and b
+    (Atkinson and Fedorov 1975); other members of the class are omitted. A pair is separated when both noncentralities suffice.
+
+    Parameters
+    ----------
+    coordinates : Coordinates
+        Of the baseline with all causes.
+    causes : sequence of Cause
+    questions : int
+        Candidate effects of the search.
+
+    """
+
+    def __init__(self, coordinates: Coordinates, causes: Sequence[Cause], questions: int):
+        self.coordinates, self.causes = coordinates, tuple(causes)
+        self.pairs = [(a, b) for a in self.causes for b in self.causes if a is not b]
+        self.words = ' and '.join(cause.key[1] for cause in causes)
+        self.enough = {cause.key: enough(len(cause.places), questions) for cause in self.causes}
+        self.reachable = np.ones(len(self.pairs), bool)
+        """Pairs that some motion separates: no time is planned for the remaining pairs, which are reported."""
+
+    def noncentrality(self, covariance: np.ndarray) -> np.ndarray:
+        """Return lambda of each pair in units of the sufficient value, shape (k, n_pairs)."""
+        found = np.empty((len(covariance), len(self.pairs)))
+        prior = self.coordinates.prior_information
+        for number, (a, b) in enumerate(self.pairs):
+            others = [cause.places for cause in self.causes if cause is not a and cause is not b]
+            out = np.concatenate(others) if others else np.zeros(0, int)
+            own = covariance[:, a.places[:, None], a.places]
+            if len(out):
+                cross = covariance[:, a.places[:, None], out]
+                own = own - cross @ np.linalg.solve(covariance[:, out[:, None], out], cross.transpose(0, 2, 1))
+            information = np.linalg.inv(own) - prior[np.ix_(a.places, a.places)]
+            found[:, number] = np.einsum('i,kij,j->k', a.size, information, a.size) / self.enough[a.key]
+        return np.maximum(found, 1e-12)
+
+    def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
+        """Return half the sum of the logarithms of the shortfall of separable pairs, the worst weighted three times."""
+        lacking = np.maximum(-0.5 * np.log(self.noncentrality(covariance)[:, self.reachable] / margin**2), 0.0)
+        return lacking.sum(axis=1) + 2.0 * lacking.max(axis=1, initial=0.0)
+
+    def leave_out_of_reach(self, covariance: np.ndarray) -> None:
+        """Drop pairs, in either order, that this covariance, (n, n), a lower bound of all plans, does not separate."""
+        enough_left = self.noncentrality(covariance[None])[0] >= 1.0
+        apart = {(a.key, b.key) for (a, b), reached in zip(self.pairs, enough_left, strict=True) if reached}
+        self.reachable = np.array([(a.key, b.key) in apart and (b.key, a.key) in apart for a, b in self.pairs])
+
+    def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
+        """Return the pairs that would not be separated."""
+        found = self.noncentrality(covariance[None])[0]
+        return tuple(dict.fromkeys(' and '.join(sorted((a.key[1], b.key[1])))
+                                   for (a, b), value in zip(self.pairs, found, strict=True) if value < 1.0))
+
+
+def enough(size: int, questions: int) -> float:
+    """
+    Return the noncentrality with which an effect of this number of parameters is identified and preferred with probability POWER.
+
+    Named: its chi-square beyond the search's threshold for so many questions. Preferred: of two models of which one is right the
+    logarithm of the likelihood ratio is normal with mean ``lambda / 2`` and variance ``lambda``; it must exceed the search's TIE.
+    """
+    from scipy.stats import ncx2  # here, because its import is slow
+
+    threshold = chi2_isf(FAMILY_WISE / questions, size)
+    named = next(value for value in np.geomspace(1.0, 1e4, 2000) if ncx2.sf(threshold, size, value) >= POWER)
+    quantile = norm_ppf(POWER)
+    return float(max(named, (quantile + np.sqrt(quantile**2 + 2 * TIE))**2))

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,12 +25,11 @@ from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel, ReferenceNoise
-from imu_calibration.planning.coordinates import Coordinates
-from imu_calibration.planning.goals import ToldApart, WithinTolerances
+from imu_calibration.planning.coordinates import Coordinates, ToldApart, WithinTolerances
 from imu_calibration.planning.motions import MotionKind, PlannedMotion, trajectory
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.search import Offers, exchanged, greedy, meets
-from imu_calibration.planning.situation import Situation
+from imu_calibration.planning.situation import PROBABILITY, Situation
 from imu_calibration.reference.motion_limits import MotionLimits, limits_of
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
@@ -241,7 +241,7 @@ def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: d
     ----------
     table : Table
     noise : mapping
-        Sensor -> NoiseModel of single samples at `rate`, see `planning.noise`; encoder steps are those of the table.
+        Sensor -> NoiseModel of single samples at `rate`, see `noise_of_grade`; encoder steps are those of the table.
     tolerances : mapping, optional
         {section: {effect: tolerance}}, SI.
     rate : float
@@ -263,3 +263,45 @@ def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: d
     if calibration is not None:
         planner.take(calibration)
     return planner
+
+
+FORMAT = 'imu_calibration/plan/1'
+
+
+def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of plan.yaml: plain data in SI, except angles of joints in degrees, named so."""
+    begins = np.concatenate([[0.0], plan.ends[:-1]]) if len(plan.ends) else []
+    return {
+        'format': FORMAT,
+        'seconds': round(plan.seconds, 3),
+        'lower_bound_seconds': None if np.isnan(plan.lower_bound_seconds) else round(plan.lower_bound_seconds, 3),
+        'probability': PROBABILITY,
+        'joints': list(plan.motions[0].joint_names) if plan.motions else [],
+        'motions': [_motion(motion, float(begin), float(end)) for motion, begin, end in zip(plan.motions, begins, plan.ends, strict=True)],
+        'parameters': {name: {'sd': float(f'{plan.sd[k]:.6g}'), 'tolerance': float(f'{plan.tolerances[k]:.6g}'),
+                              'met': name not in plan.missing} for k, name in enumerate(plan.model.param_names) if plan.wanted[k]},
+        'missing': list(plan.missing),
+        'provenance': provenance,
+    }
+
+
+def _motion(motion: PlannedMotion, begin: float, end: float) -> dict[str, Any]:
+    turns = motion.limits.turns
+    units = np.where(turns, 180.0 / np.pi, 1.0)
+    rates = [segment.rate_to for segment in motion.segments if segment.kind == 'spin']
+    found = {'kind': str(motion.kind), 'text': motion.words, 'begins': round(begin, 3), 'ends': round(end, 3),
+             'seconds': round(motion.seconds, 3), 'place_deg_or_m': np.round(motion.place * units, 4).tolist()}
+    if rates:
+        found['rates_deg_s_or_m_s'] = np.round(np.array(rates) * units, 4).tolist()
+    return found
+
+
+def trajectory_to_mapping(points: TrajectoryPoints) -> dict[str, Any]:
+    """Return a trajectory as the fields of trajectory_msgs/JointTrajectory, as ``ros2 topic pub`` reads them."""
+    columns = {'positions': points.position, 'velocities': points.rate, 'accelerations': points.acceleration}
+    rows = []
+    for k, time in enumerate(points.time):
+        seconds, nanoseconds = divmod(round(float(time) * 1e9), 1_000_000_000)
+        rows.append({name: [float(f'{value:.9g}') for value in values[k]] for name, values in columns.items() if values is not None}
+                    | {'time_from_start': {'sec': seconds, 'nanosec': nanoseconds}})
+    return {'joint_names': list(points.joint_names), 'points': rows}

@@ -14,8 +14,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.planning.belief import exact_information
-from imu_calibration.planning.coordinates import Coordinates
-from imu_calibration.planning.goals import Cause, ToldApart
+from imu_calibration.planning.coordinates import Cause, Coordinates, ToldApart
 from imu_calibration.planning.planner import Planner
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.situation import Situation

@@ -7,18 +7,27 @@ from functools import cached_property
 
 import numpy as np
 
+from imu_calibration.allan.figures import NoiseFigures, bias_processes
 from imu_calibration.chances import chi2_isf
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.errors import InputError
+from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.window_statistics import BATCH_DOF
-from imu_calibration.planning.belief import Belief, additive_bound, common_variance, exact_information, least_bias_variance
-from imu_calibration.planning.coordinates import Coordinates
-from imu_calibration.planning.goals import Goal, WithinTolerances
+from imu_calibration.planning.belief import (
+    Belief,
+    PlannedWindow,
+    WindowPredictor,
+    additive_bound,
+    common_variance,
+    exact_information,
+    least_bias_variance,
+)
+from imu_calibration.planning.coordinates import Coordinates, Goal, WithinTolerances
 from imu_calibration.planning.motions import MotionKind, PlannedMotion
 from imu_calibration.planning.relaxation import LONGEST, Relaxation, relax
 from imu_calibration.planning.repertoire import Repertoire
-from imu_calibration.planning.windows import PlannedWindow, WindowPredictor
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
+from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise
 
 FIRST_REST = 4.0
 """Seconds of the first rest at least, from which the noise of the IMU is estimated."""
@@ -261,3 +270,40 @@ class Situation:
         """Return the standard deviations of the requested parameters, in tolerances, shape (p,)."""
         asked = self.coordinates.asked
         return np.sqrt(np.einsum('pn,nm,pm->p', asked, covariance, asked))
+
+
+def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
+    """
+    Return sensor -> NoiseModel of the samples of a simulated IMU: white noise, and a bias that wanders by its instability.
+
+    Parameters
+    ----------
+    noise : SimulatedNoise
+    rate : float
+        Samples per second.
+
+    """
+    figures = {'accelerometer': (noise.accel_density, noise.accel_instability, noise.accel_resolution),
+               'gyroscope': (noise.gyro_density, noise.gyro_instability, noise.gyro_resolution)}
+    return {sensor: NoiseModel(np.full(3, density**2 * rate + resolution**2 / 12), np.ones(3),
+                               bias_processes=(BiasProcess(instability, noise.correlation_time),) if instability > 0 else ())
+            for sensor, (density, instability, resolution) in figures.items()}
+
+
+def expected_noise(figures: NoiseFigures | None, grade: str, rate: float) -> dict[str, NoiseModel]:
+    """Return sensor -> NoiseModel of samples at `rate` (Hz): the identified model, or that of a grade."""
+    require_grade(grade)
+    return noise_of_grade(GRADES[grade].noise, rate) if figures is None else noise_of_figures(figures, rate)
+
+
+def require_grade(grade: str) -> None:
+    """Refuse a grade that is none with an InputError."""
+    if grade not in GRADES:
+        raise InputError(f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise")
+
+
+def noise_of_figures(figures: NoiseFigures, rate: float) -> dict[str, NoiseModel]:
+    """Return sensor -> NoiseModel of samples at `rate` (Hz) from identified noise, its slow part as Gauss-Markov processes."""
+    slow = bias_processes(figures)
+    return {sensor: NoiseModel(np.array([axis.white**2 * rate for axis in figures.sensor(sensor)]), np.ones(3), bias_processes=slow[sensor])
+            for sensor in SENSORS}

@@ -1,15 +1,15 @@
-"""Input of the checks, gathered in one pass over the blocks in bounded memory."""
+"""Input of the checks, gathered in one pass over the blocks in bounded memory; and their results."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from imu_calibration.preflight.chunks import Chunks, ChunkSeries
-from imu_calibration.preflight.extremes import Extremes
 from imu_calibration.preflight.frozen_parts import FrozenPart, StandingJoints, frozen_chunks, frozen_joints, frozen_parts
-from imu_calibration.preflight.full_scale import factor_between_rests
+from imu_calibration.preflight.full_scale import Extremes, factor_between_rests
 from imu_calibration.preflight.rest import Rest, find_rest
 from imu_calibration.preflight.turning import Turning, relate_turns
 from imu_calibration.samples import smallest_step
@@ -184,3 +184,43 @@ class _Steps:
     def summary(self):
         """Return (first stamp, last stamp, share of irregular steps)."""
         return self.first_ns, self.last_ns, self._n_irregular / max(self._n_steps, 1)
+
+
+class Severity(StrEnum):
+    """How much a finding matters, the worst first."""
+
+    REFUSE = 'refuse'
+    """The result would be wrong."""
+    WARNING = 'warning'
+    """It may suffer."""
+    NOTE = 'note'
+    """Worth knowing."""
+    GOOD = 'good'
+    """Checked and in order."""
+
+
+REFUSE, WARNING, NOTE, GOOD = Severity
+
+
+@dataclass(frozen=True)
+class CheckFinding:
+    """One line about a recording."""
+
+    check: str
+    """Name of the check."""
+    severity: Severity
+    """How much it matters."""
+    text: str
+    """Requirement, received value and remedy; for GOOD, the observation."""
+    samples: int = 0
+    """Samples that are unusable because of it and that no other count holds."""
+    key: str | None = None
+    """The missing input, a key of `errors.KEYS`."""
+
+    def named(self, name: str) -> 'CheckFinding':
+        """Return the finding with the name of its recording before the text."""
+        return replace(self, text=f'{name}: {self.text}')
+
+    def to_mapping(self) -> dict:
+        """Return the entry for the calibration file."""
+        return {'check': self.check, 'severity': self.severity, 'text': self.text, 'samples': self.samples}

@@ -6,10 +6,9 @@ import numpy as np
 
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.preflight.axes import CLEAR, match_axes
 from imu_calibration.preflight.checks import refuse
-from imu_calibration.preflight.exchanges import find_exchange
-from imu_calibration.preflight.finding import REFUSE, CheckFinding
+from imu_calibration.preflight.evidence import REFUSE, CheckFinding
+from imu_calibration.preflight.exchanges import CLEAR, find_exchange, match_axes
 from imu_calibration.preflight.on_table import exchanged, same_motion, signs_or_delay
 from imu_calibration.preflight.standing_still import standing_still
 from imu_calibration.preflight.value_checks import force_error

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imu_calibration.preflight.finding import GOOD, NOTE, WARNING, CheckFinding
+from imu_calibration.preflight.evidence import GOOD, NOTE, WARNING, CheckFinding
 
 OLD = 0.5
 """s; transforms and filters drop older messages, and the delay of a driver is much smaller."""

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from imu_calibration.preflight.evidence import REFUSE, CheckFinding
 from imu_calibration.preflight.exchanges import LEAST_SAMPLES, SAME, SURE, Exchange
-from imu_calibration.preflight.finding import REFUSE, CheckFinding
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.preflight.finding import REFUSE, CheckFinding
+from imu_calibration.preflight.evidence import REFUSE, CheckFinding
 from imu_calibration.preflight.frozen_parts import TURNS
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.table import Table

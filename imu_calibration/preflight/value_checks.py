@@ -6,9 +6,8 @@ import numpy as np
 
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.errors import InputError
-from imu_calibration.preflight.axes import CLEAR, match_axes
-from imu_calibration.preflight.evidence import RecordingEvidence
-from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING, CheckFinding
+from imu_calibration.preflight.evidence import GOOD, NOTE, REFUSE, WARNING, CheckFinding, RecordingEvidence
+from imu_calibration.preflight.exchanges import CLEAR, match_axes
 from imu_calibration.preflight.frozen_parts import SENSOR_COLUMNS
 from imu_calibration.preflight.full_scale import FACTORS, nearest_power
 from imu_calibration.units import OTHER_UNITS, significant, unit_of_rest

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from imu_calibration.reference.rotations import rotation
+from imu_calibration.reference.reference_motion import rotation
 
 if TYPE_CHECKING:
     from imu_calibration.reference.joint import Joint

@@ -10,8 +10,7 @@ import numpy as np
 from imu_calibration.reference.axis_angles import axis_error_directions
 from imu_calibration.reference.earth import earth_rate_n
 from imu_calibration.reference.leaning_axes import wobble_at
-from imu_calibration.reference.reference_motion import Reference
-from imu_calibration.reference.rotations import align, rotation
+from imu_calibration.reference.reference_motion import Reference, align, rotation
 
 if TYPE_CHECKING:
     from imu_calibration.reference.joint_motion import JointMotion

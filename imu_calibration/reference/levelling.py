@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.reference.rotations import rotation
+from imu_calibration.reference.reference_motion import rotation
 from imu_calibration.reference.table import Table, base_heading_deg
 
 

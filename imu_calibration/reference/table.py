@@ -9,10 +9,19 @@ import numpy as np
 
 from imu_calibration.errors import InputError
 from imu_calibration.reference.axis_angles import axis_angles
-from imu_calibration.reference.checked_values import finite_number, require_keys, three_numbers, unit_vector
 from imu_calibration.reference.earth import NORMAL_GRAVITY_ACCURACY, normal_gravity
-from imu_calibration.reference.joint import Joint, JointNames, joint_from_mapping, joint_to_mapping, place_names
-from imu_calibration.reference.rotations import align, rotation_from_rpy
+from imu_calibration.reference.joint import (
+    Joint,
+    JointNames,
+    finite_number,
+    joint_from_mapping,
+    joint_to_mapping,
+    place_names,
+    require_keys,
+    three_numbers,
+    unit_vector,
+)
+from imu_calibration.reference.reference_motion import align, rotation_from_rpy
 
 _MOUNT_KEYS = ('rpy_deg', 'xyz')
 

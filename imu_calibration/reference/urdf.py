@@ -12,9 +12,8 @@ import numpy as np
 from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.documents import LARGEST
 from imu_calibration.errors import InputError, printable, shortened
-from imu_calibration.reference.checked_values import require_keys, three_numbers
-from imu_calibration.reference.joint import LIMIT_KEYS, Joint, JointLimits, Mimic, limits_from_mapping
-from imu_calibration.reference.rotations import rotation_from_rpy, rpy_from_rotation
+from imu_calibration.reference.joint import LIMIT_KEYS, Joint, JointLimits, Mimic, limits_from_mapping, require_keys, three_numbers
+from imu_calibration.reference.reference_motion import rotation_from_rpy, rpy_from_rotation
 from imu_calibration.reference.table import Table, joint_entries, site_from_mapping
 
 JOINT_ERRORS = {'joint_error_rad': 1e-3, 'joint_error_m': 1e-3}

@@ -3,9 +3,9 @@
 import numpy as np
 
 from imu_calibration.allan import summary
-from imu_calibration.allan.dead_reckoning import position_budget
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification
+from imu_calibration.allan.summary import position_budget
 from imu_calibration.allan.terms import DETERMINED, HELD, WEAK
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.report.noise_curve import draw_curve

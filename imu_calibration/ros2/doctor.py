@@ -8,7 +8,7 @@ from ros2cli.node.direct import DirectNode
 from ros2doctor.api import DoctorCheck, DoctorReport, Report, Result
 from ros2doctor.api.format import doctor_error, doctor_warn
 
-from imu_calibration.preflight.finding import REFUSE, WARNING
+from imu_calibration.preflight.evidence import REFUSE, WARNING
 from imu_calibration.ros2.imu_streams import StreamFindings, look
 
 CATEGORY = 'imu'

@@ -11,7 +11,7 @@ from sensor_msgs.msg import Imu
 
 from imu_calibration.nodes.inputs import BatchInput
 from imu_calibration.preflight.checks import Preflight
-from imu_calibration.preflight.finding import GOOD, REFUSE, WARNING, CheckFinding
+from imu_calibration.preflight.evidence import GOOD, REFUSE, WARNING, CheckFinding
 from imu_calibration.preflight.message_checks import check_messages
 from imu_calibration.segmentation.block_cleaning import BlockCleaner
 from msg_adapters.imu_heads import ImuHeads

@@ -5,7 +5,7 @@ import numpy as np
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.quiet_detector import BELOW, SPANS, QuietFloor, least_variance, low_passed, quiet_samples
-from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.segmentation.window import WindowSettings
 
 _TURNING_SD = 30.0
 """A mean rate that differs from the usual one by this many noise sds and a hundredth of the largest rate is a steady turn, not a bias."""

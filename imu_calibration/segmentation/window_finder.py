@@ -10,9 +10,8 @@ from imu_calibration.samples import JointSamples, NominalScaling, SampleBlock
 from imu_calibration.segmentation.block_cleaning import STREAMS, BlockCleaner, Watcher
 from imu_calibration.segmentation.quiet_detector import QuietFloor
 from imu_calibration.segmentation.stream_alignment import JOINT_WAIT, MotionChunks
-from imu_calibration.segmentation.window import UnusedReason, Window, WindowKind
+from imu_calibration.segmentation.window import UnusedReason, Window, WindowKind, WindowSettings
 from imu_calibration.segmentation.window_cutter import WindowCutter
-from imu_calibration.segmentation.window_settings import WindowSettings
 
 
 class MotionGatherer:

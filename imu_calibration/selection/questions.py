@@ -8,8 +8,8 @@ import numpy as np
 from imu_calibration.effects.base import SECTIONS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_at_rest import VIBRATES
+from imu_calibration.reference.signal_history import HALF_WIDTH
 from imu_calibration.reference.table import Table
-from imu_calibration.reference.thermal_branch import HALF_WIDTH
 from imu_calibration.segmentation.quiet_detector import least_variance
 from imu_calibration.segmentation.window import Window
 

@@ -12,8 +12,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.reference_motion import lever_matrix
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
-from imu_calibration.simulation.hidden_causes import Cause, Felt
-from imu_calibration.simulation.sensor_noise import quantise, read_encoders
+from imu_calibration.simulation.sensor_noise import Cause, Felt, quantise, read_encoders
 from imu_calibration.simulation.session import SimulationOptions, answered, temperature_at
 from imu_calibration.simulation.table_controller import TableController
 

@@ -13,7 +13,7 @@ from imu_calibration.errors import InputError
 from imu_calibration.reference.earth import local_gravity
 from imu_calibration.resources import config_file
 from imu_calibration.samples import NominalScaling
-from imu_calibration.segmentation.window_settings import WindowSettings
+from imu_calibration.segmentation.window import WindowSettings
 from imu_calibration.settings import override
 from imu_calibration.use_cases.recordings import Topics
 

@@ -8,10 +8,9 @@ import numpy as np
 from imu_calibration import files
 from imu_calibration.calibration.document import Calibration, calibration_to_text
 from imu_calibration.compensation.evaluation import session_truth
-from imu_calibration.exports.export import Export, export
+from imu_calibration.exports.export import Export, export, find_reader, find_target
 from imu_calibration.exports.imported import import_file
-from imu_calibration.exports.motion import TrialMotion, motion_of, recorded_motion, temperature_at
-from imu_calibration.exports.registry import find_reader, find_target
+from imu_calibration.exports.loss import TrialMotion, motion_of, recorded_motion, temperature_at
 from imu_calibration.samples import ImuSamples
 from imu_calibration.use_cases.recordings import Topics, name_of, source_of, temperatures
 from imu_calibration.use_cases.stand import Stand, table_of

@@ -16,7 +16,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.preflight.checks import Preflight, unusable, warnings
-from imu_calibration.preflight.finding import REFUSE, CheckFinding
+from imu_calibration.preflight.evidence import REFUSE, CheckFinding
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.stream_cleaning import StreamStatistics
 from imu_calibration.use_cases.recordings import Source, Topics, open_bag, source_of

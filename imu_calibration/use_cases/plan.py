@@ -21,10 +21,9 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.named_models import BASE, parse_effects
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError
-from imu_calibration.planning.document import plan_to_mapping, trajectory_to_mapping
-from imu_calibration.planning.noise import expected_noise
-from imu_calibration.planning.planner import Plan, make_planner
+from imu_calibration.planning.planner import Plan, make_planner, plan_to_mapping, trajectory_to_mapping
 from imu_calibration.planning.separation import make_separator
+from imu_calibration.planning.situation import expected_noise
 from imu_calibration.reference.motion_limits import NOT_CHECKED, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.reference.table import Table
 from imu_calibration.use_cases.choices import calibration_options

@@ -10,7 +10,7 @@ from typing import Any
 
 from imu_calibration import files
 from imu_calibration.errors import InputError
-from imu_calibration.reference.root_attitude import up_of
+from imu_calibration.reference.static_transforms import up_of
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.urdf import root_of, table_from_urdf
 from imu_calibration.samples import SampleBlock

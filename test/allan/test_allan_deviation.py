@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from imu_calibration.allan.curve import SampleGrid, spread
 from imu_calibration.allan.deviation import FULL, AllanSums, averaging_factors, overlapping_allan_variance
-from imu_calibration.allan.sample_grid import SampleGrid, spread
 
 PERIOD = 0.01
 

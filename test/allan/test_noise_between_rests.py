@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.allan.between_parts import Parts
 from imu_calibration.allan.deviation import AllanSums, averaging_factors
 from imu_calibration.allan.moment_fit import Moments
 from imu_calibration.allan.scale_covariance import ScaleCovariance
 from imu_calibration.allan.terms import identify_axis, predicted, scatter_of
+from imu_calibration.allan.trends import Parts
 
 PERIOD, LENGTH, PARTS = 0.01, 2000, 12
 FACTORS = averaging_factors(LENGTH)

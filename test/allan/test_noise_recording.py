@@ -18,8 +18,7 @@ from imu_calibration.allan.terms import HELD, Term, identify_axis
 from imu_calibration.allan.trends import AxisTrend, Blocks, TrendSearch
 from imu_calibration.cli.main import main
 from imu_calibration.errors import DocumentError, InputError
-from imu_calibration.exports.export import export
-from imu_calibration.exports.registry import find_target
+from imu_calibration.exports.export import export, find_target
 from imu_calibration.report.noise_page import noise_report
 from imu_calibration.samples import ImuSamples, SampleBlock, TemperatureSamples
 from msg_adapters.write import write_session

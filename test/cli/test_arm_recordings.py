@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from imu_calibration.cli.main import main
 from imu_calibration.errors import InputError
 from imu_calibration.files import read_calibration, read_robot_description
-from imu_calibration.reference.root_attitude import up_of
+from imu_calibration.reference.static_transforms import up_of
 from imu_calibration.samples import ImuSamples, JointSamples
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.use_cases.recordings import Topics

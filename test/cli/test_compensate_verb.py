@@ -13,7 +13,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.reference.reference_motion import Reference, lever_matrix
-from imu_calibration.reference.thermal_branch import ThermalBranch
+from imu_calibration.reference.signal_history import ThermalBranch
 from imu_calibration.samples import ImuSamples, TemperatureSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.imu import FIELDS, parse_imu

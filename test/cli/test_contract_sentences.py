@@ -9,9 +9,8 @@ from imu_calibration.calibration.check import CheckResult
 from imu_calibration.calibration.decision import NO_PROOF, reason_of
 from imu_calibration.calibration.document import calibration_from_text
 from imu_calibration.errors import InputError, with_hint
-from imu_calibration.exports.export import loss_lines
+from imu_calibration.exports.export import find_target, loss_lines
 from imu_calibration.exports.loss import Loss
-from imu_calibration.exports.registry import find_target
 from imu_calibration.use_cases.check import Checked
 
 from worlds.compensation_cases import random_calibration

@@ -19,8 +19,7 @@ from imu_calibration.calibration.document import calibration_to_text
 from imu_calibration.cli.fleet_run import units_csv
 from imu_calibration.documents import from_text
 from imu_calibration.errors import DocumentError, InputError
-from imu_calibration.exports.export import export
-from imu_calibration.exports.registry import find_target
+from imu_calibration.exports.export import export, find_target
 from imu_calibration.files import make_folder, write_text
 from imu_calibration.reference.urdf import root_of
 from imu_calibration.report.figures import draw

@@ -5,9 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.compensation.bias_update import MOST_MOVED, GyroBiasUpdate
-from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, LEAST, MOVED, UNIT, WAITING, CalibrationHealth, HealthOptions
-from imu_calibration.compensation.stop_watch import StopWatch
+from imu_calibration.compensation.health import (
+    FOLLOWED,
+    HARMS,
+    HOLDS,
+    LEAST,
+    MOST_MOVED,
+    MOVED,
+    UNIT,
+    WAITING,
+    CalibrationHealth,
+    GyroBiasUpdate,
+    HealthOptions,
+    StopWatch,
+)
 from imu_calibration.compensation.stops import LONGEST, Stop, StopDetector
 from imu_calibration.constants import DEG
 

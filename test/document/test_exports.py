@@ -21,14 +21,11 @@ from imu_calibration.compensation.compensate import compensate
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.errors import DocumentError, InputError
-from imu_calibration.exports.export import UNIT, export, loss_lines
-from imu_calibration.exports.gauges import lower_times_rotation, upper_times_rotation
-from imu_calibration.exports.holdings import holding_of
+from imu_calibration.exports.affine import holding_of, lower_times_rotation, upper_times_rotation
+from imu_calibration.exports.export import UNIT, all_targets, export, find_reader, find_target, loss_lines
 from imu_calibration.exports.imported import import_file
-from imu_calibration.exports.loss import NOTHING
-from imu_calibration.exports.motion import motion_of, standard_motion
+from imu_calibration.exports.loss import NOTHING, motion_of, standard_motion
 from imu_calibration.exports.page import rendered
-from imu_calibration.exports.registry import all_targets, find_reader, find_target
 from imu_calibration.exports.target import Readings
 from imu_calibration.reference.reference_motion import Reference, lever_matrix
 from imu_calibration.units import significant

@@ -14,8 +14,7 @@ from imu_calibration.calibration.document import calibration_from_text, calibrat
 from imu_calibration.calibration.nominal import with_nominal
 from imu_calibration.cli.main import main
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.exports.export import export
-from imu_calibration.exports.registry import find_target
+from imu_calibration.exports.export import export, find_target
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock
 from msg_adapters.bag import open_recording

@@ -10,9 +10,8 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.signal_history import BandVariance, ThermalBranch
 from imu_calibration.reference.table import Table
-from imu_calibration.reference.thermal_branch import ThermalBranch
-from imu_calibration.reference.vibration import BandVariance
 
 from worlds.hiding import options_of
 from worlds.physics import encoder_reading, make_session

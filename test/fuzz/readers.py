@@ -24,9 +24,8 @@ from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.documents import from_text
 from imu_calibration.errors import InputError
-from imu_calibration.exports.export import export
+from imu_calibration.exports.export import all_targets, export
 from imu_calibration.exports.imported import import_file
-from imu_calibration.exports.registry import all_targets
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.urdf import root_of, table_from_urdf
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples

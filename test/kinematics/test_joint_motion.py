@@ -6,12 +6,17 @@ from refusal import refused
 from scipy.interpolate import BSpline
 
 from imu_calibration.errors import InputError
-from imu_calibration.reference.encoder import encoder_step, with_encoder_harmonics
-from imu_calibration.reference.joint_curve import fit_joint_curve
-from imu_calibration.reference.joint_fit import JointSettings, check_velocity
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.quintic_spline import Knots, design_matrix, design_values, evaluate_pieces, normal_bands, piece_coefficients
-from imu_calibration.reference.smoothing import PenalisedSpline
+from imu_calibration.reference.joint_curve import JointSettings, check_velocity, fit_joint_curve
+from imu_calibration.reference.joint_motion import JointMotion, encoder_step, with_encoder_harmonics
+from imu_calibration.reference.smoothing import (
+    Knots,
+    PenalisedSpline,
+    design_matrix,
+    design_values,
+    evaluate_pieces,
+    normal_bands,
+    piece_coefficients,
+)
 
 STEP_0088 = np.radians(0.088)
 QUIET = JointSettings()

@@ -9,8 +9,8 @@ from imu_calibration.cli.main import main
 from imu_calibration.driving.campaign import Campaign, CampaignSettings
 from imu_calibration.driving.path_watch import at_rest
 from imu_calibration.errors import InputError
-from imu_calibration.planning.noise import noise_of_grade
 from imu_calibration.planning.planner import NextMotion, make_planner
+from imu_calibration.planning.situation import noise_of_grade
 from imu_calibration.reference.motion_limits import limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.urdf import table_from_urdf

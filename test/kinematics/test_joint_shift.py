@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.reference.joint_delay import shifted
-from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.joint_motion import JointMotion, shifted
 
 NAMES = ('position', 'rate', 'acceleration', 'jerk')
 

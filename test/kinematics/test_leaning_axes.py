@@ -7,9 +7,8 @@ import pytest
 
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.reference.axis_angles import axis_error_directions, with_axis_angles
-from imu_calibration.reference.encoder import with_encoder_harmonics
 from imu_calibration.reference.joint import Joint
-from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.joint_motion import JointMotion, with_encoder_harmonics
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.leaning_axes import WOBBLES, with_sag, with_wobble, wobble_at
 from imu_calibration.reference.table import Table

@@ -9,7 +9,7 @@ from imu_calibration import navigation
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import InputError
 from imu_calibration.papers import zhang2017 as zhang
-from imu_calibration.papers import zhang2017_designs as zhang_designs
+from imu_calibration.papers import zhang2017_joint_fit as zhang_designs
 from imu_calibration.papers import zhang2017_joint_fit as zhang_joint
 from imu_calibration.papers import zhang2017_navigation as zhang_claims
 from imu_calibration.reference.reference_motion import Reference

@@ -9,8 +9,8 @@ from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_at_rest import white_noise
 from imu_calibration.estimation.window_statistics import reduce_windows
+from imu_calibration.reference.signal_history import BandVariance
 from imu_calibration.reference.table import Table
-from imu_calibration.reference.vibration import BandVariance
 from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.window_finder import MotionGatherer
 from imu_calibration.selection.questions import testable_effects as asked_of

@@ -8,7 +8,7 @@ import yaml
 
 from imu_calibration import files
 from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.planning.noise import noise_of_grade
+from imu_calibration.planning.situation import noise_of_grade
 from imu_calibration.reference.static_transforms import StaticTransforms
 from imu_calibration.reference.urdf import table_from_urdf
 from imu_calibration.simulation.sensor_noise import GRADES

@@ -10,11 +10,10 @@ from imu_calibration.errors import InputError
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.motion_limits import MotionLimits
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
-from imu_calibration.simulation.hidden_causes import CAUSES, Felt, hidden_causes
 from imu_calibration.simulation.joint_trajectory import braking_from, trajectory_from
 from imu_calibration.simulation.live import LiveSimulation
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.sensor_noise import SimulatedNoise
+from imu_calibration.simulation.sensor_noise import CAUSES, Felt, SimulatedNoise, hidden_causes
 from imu_calibration.simulation.session import SimulationOptions, simulate
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 from msg_adapters.write import write_session

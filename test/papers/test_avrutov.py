@@ -6,7 +6,7 @@ from refusal import refused
 
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.papers import avrutov2017 as avrutov
-from imu_calibration.papers import avrutov2017_budget as avrutov_budget
+from imu_calibration.papers import avrutov2017 as avrutov_budget
 from imu_calibration.papers.linear_least_squares import (
     condition_numbers,
     null_directions,

@@ -9,18 +9,24 @@ from refusal import refused
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.papers import zhang2017 as zhang
-from imu_calibration.papers.zhang2017_designs import (
+from imu_calibration.papers.zhang2017_joint_fit import (
     DESIGNS,
+    PARAM_NAMES,
     average_headings,
     design_runs,
     face,
+    fit_joint,
+    fit_triad,
+    jacobian,
+    judge_design,
     oscillation,
+    predict,
     skewed_axes,
     spin,
     stack_runs,
     two_axis,
+    weak_arms,
 )
-from imu_calibration.papers.zhang2017_joint_fit import PARAM_NAMES, fit_joint, fit_triad, jacobian, judge_design, predict, weak_arms
 
 from worlds.figures import show
 

@@ -12,12 +12,11 @@ from refusal import refused
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.driving.campaign import IN_VAIN, PATIENCE, TIME_OVER, Campaign, CampaignSettings, Suspect
+from imu_calibration.driving.campaign import IN_VAIN, PATIENCE, TIME_OVER, Campaign, CampaignSettings, Suspect, separator_of, with_suspect
 from imu_calibration.driving.driver import Driver, DriverSettings, DriveState
 from imu_calibration.driving.path_watch import PathWatch, at_rest
-from imu_calibration.driving.separating import separator_of, with_suspect
 from imu_calibration.errors import InputError
-from imu_calibration.planning.noise import noise_of_grade
+from imu_calibration.planning.situation import noise_of_grade
 from imu_calibration.reference.motion_limits import MotionLimits
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.trajectory_points import TrajectoryPoints

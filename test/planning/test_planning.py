@@ -18,16 +18,14 @@ from imu_calibration.effects.named_models import NAMED_MODELS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.window_statistics import batch_statistics
-from imu_calibration.planning import windows
-from imu_calibration.planning.belief import exact_information
+from imu_calibration.planning import belief
+from imu_calibration.planning.belief import SAMPLING, WindowPredictor, exact_information
 from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.planning.motions import MotionKind
-from imu_calibration.planning.noise import noise_of_grade
 from imu_calibration.planning.planner import DONE, make_planner
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.separation import make_separator
-from imu_calibration.planning.situation import LEAST_RESTS, Situation
-from imu_calibration.planning.windows import SAMPLING, WindowPredictor
+from imu_calibration.planning.situation import LEAST_RESTS, Situation, noise_of_grade
 from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.urdf import table_from_urdf
@@ -316,11 +314,11 @@ def test_the_memory_of_a_plan_does_not_grow_with_the_square_of_an_arms_joints(ta
         lengths.append(len(motion))
         return columns(*arguments, motion=motion, **options)
 
-    monkeypatch.setattr(windows, 'columns', counted)
+    monkeypatch.setattr(belief, 'columns', counted)
     model = choose_model(CalibrationOptions(), table)
     move = MotionBuilder(3)
     move.move_to([1.0, -0.5, 2.0])
     found = WindowPredictor(table, Coordinates(model, tolerances_of(model)), NOISE, rate=100.0).predict([tuple(move.segments)] * 1000)
-    assert len(found) == 1000 and max(lengths) <= 1.05 * windows.BLOCK < sum(lengths) / 2
+    assert len(found) == 1000 and max(lengths) <= 1.05 * belief.BLOCK < sum(lengths) / 2
     arm = table_from_urdf(SEVEN_AXES, 'imu_link', {'gravity': 9.81})
     assert 20 <= len(Repertoire(arm, limits_of(arm)).places) <= 45

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.preflight.finding import GOOD, NOTE, WARNING
+from imu_calibration.preflight.evidence import GOOD, NOTE, WARNING
 from imu_calibration.preflight.message_checks import ABSENT, OLD, QUANTITIES, MessageEvidence, check_messages
 from imu_calibration.samples import ImuSamples
 from msg_adapters.encode import encode_imu, rows

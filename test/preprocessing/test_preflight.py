@@ -11,9 +11,9 @@ from refusal import refused
 from imu_calibration.cli.main import main
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
-from imu_calibration.preflight.axes import match_axes, signed_permutations
 from imu_calibration.preflight.checks import Preflight
-from imu_calibration.preflight.finding import GOOD, NOTE, REFUSE, WARNING
+from imu_calibration.preflight.evidence import GOOD, NOTE, REFUSE, WARNING
+from imu_calibration.preflight.exchanges import match_axes, signed_permutations
 from imu_calibration.preflight.joint_checks import check_force
 from imu_calibration.preflight.value_checks import force_error
 from imu_calibration.reference.table import Table

@@ -13,9 +13,9 @@ from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, Tempe
 from imu_calibration.segmentation.spike_filter import REACH
 from imu_calibration.segmentation.static_detector import find_still
 from imu_calibration.segmentation.stream_alignment import JOINT_WAIT
-from imu_calibration.segmentation.wander_limit import SHORTEST, WanderLimit
+from imu_calibration.segmentation.window import WindowSettings
+from imu_calibration.segmentation.window_cutter import SHORTEST, WanderLimit
 from imu_calibration.segmentation.window_finder import MotionGatherer
-from imu_calibration.segmentation.window_settings import WindowSettings
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 
 START = 1_700_000_000 * 10 ** 9

@@ -12,9 +12,8 @@ from imu_calibration.errors import InputError
 from imu_calibration.resources import config_file
 from imu_calibration.samples import SampleBlock
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.replay import ReplayNoise, replay
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import ReplayNoise, SimulationOptions, random_values, replay, simulate
 from imu_calibration.use_cases import simulate as use_case
 
 MODEL = SensorModel(('bias', 'matrix', 'accel_size_effect', 'accel_thermal_bias'), ('bias', 'matrix', 'gyro_g_sensitivity'))

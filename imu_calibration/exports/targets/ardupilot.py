@@ -6,9 +6,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError
-from imu_calibration.exports.affine import AffineImu
-from imu_calibration.exports.gauges import forward_right_down
-from imu_calibration.exports.holdings import OFFSETS, SCALES, THERMAL_OFFSETS, of
+from imu_calibration.exports.affine import OFFSETS, SCALES, THERMAL_OFFSETS, AffineImu, forward_right_down, of
 from imu_calibration.exports.target import Page, Read, Readings, Target
 from imu_calibration.exports.text import XYZ, commented, plain, read_parameters, refuse_curved, vector_of
 

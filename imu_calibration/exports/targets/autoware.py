@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.errors import InputError, shortened
-from imu_calibration.exports.affine import AffineImu
-from imu_calibration.exports.holdings import OFFSETS, SCALES, of
+from imu_calibration.exports.affine import OFFSETS, SCALES, AffineImu, of
 from imu_calibration.exports.target import Noise, Page, Read, Readings, Target
 from imu_calibration.exports.text import numbers_at, read_yaml, section, yaml_file
 

@@ -5,9 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imu_calibration.exports.affine import AffineImu
-from imu_calibration.exports.gauges import accelerometer_lower
-from imu_calibration.exports.holdings import MATRICES, OFFSETS, THERMAL_OFFSETS
+from imu_calibration.exports.affine import MATRICES, OFFSETS, THERMAL_OFFSETS, AffineImu, accelerometer_lower
 from imu_calibration.exports.target import Noise, Page, Read, Readings, Target
 from imu_calibration.exports.text import numbers_at, plain, read_json, section
 

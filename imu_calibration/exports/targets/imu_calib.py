@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imu_calibration.exports.affine import AffineImu
-from imu_calibration.exports.holdings import MATRICES, OFFSETS, of
+from imu_calibration.exports.affine import MATRICES, OFFSETS, AffineImu, of
 from imu_calibration.exports.target import Page, Read, Readings, Target
 from imu_calibration.exports.text import numbers_at, read_yaml, yaml_file
 

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.errors import InputError
-from imu_calibration.exports.affine import AffineImu
-from imu_calibration.exports.holdings import MATRICES, OFFSETS, of
+from imu_calibration.exports.affine import MATRICES, OFFSETS, AffineImu, of
 from imu_calibration.exports.target import Read, Readings, Target
 from imu_calibration.exports.text import text_of
 

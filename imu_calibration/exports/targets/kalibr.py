@@ -7,9 +7,16 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError, shortened
-from imu_calibration.exports.affine import AffineImu, Placement
-from imu_calibration.exports.gauges import accelerometer_lower_at_x, lower_times_rotation
-from imu_calibration.exports.holdings import ARMS, G_SENSITIVITY, MATRICES, SLOW_OFFSETS
+from imu_calibration.exports.affine import (
+    ARMS,
+    G_SENSITIVITY,
+    MATRICES,
+    SLOW_OFFSETS,
+    AffineImu,
+    Placement,
+    accelerometer_lower_at_x,
+    lower_times_rotation,
+)
 from imu_calibration.exports.target import Noise, Page, Read, Readings, Target
 from imu_calibration.exports.text import numbers_at, read_yaml, section, yaml_file
 from imu_calibration.reference.reference_motion import lever_matrix

@@ -3,7 +3,7 @@
 from functools import partial
 
 from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.exports.holdings import SLOW_OFFSETS
+from imu_calibration.exports.affine import SLOW_OFFSETS
 from imu_calibration.exports.target import Noise, Page, Target
 from imu_calibration.exports.text import yaml_file
 

@@ -5,9 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imu_calibration.exports.affine import AffineImu
-from imu_calibration.exports.gauges import lower_times_rotation, upper_times_rotation
-from imu_calibration.exports.holdings import G_SENSITIVITY, MATRICES, SLOW_OFFSETS
+from imu_calibration.exports.affine import G_SENSITIVITY, MATRICES, SLOW_OFFSETS, AffineImu, lower_times_rotation, upper_times_rotation
 from imu_calibration.exports.target import Page, Read, Readings, Target
 from imu_calibration.exports.targets.kalibr import noise, read_densities
 from imu_calibration.exports.text import numbers_at, read_yaml, section, yaml_file
