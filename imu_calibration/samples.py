@@ -93,7 +93,7 @@ class TemperatureSamples(_Columns):
     temperature_c: np.ndarray
     """Temperature, degrees Celsius, shape (n,)."""
     branch: np.ndarray | None = None
-    """Thermal branch (`reference.thermal_branch`), in [-1, 1], shape (n,); None if not computed."""
+    """Thermal branch (`reference.signal_history`), in [-1, 1], shape (n,); None if not computed."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -164,9 +164,9 @@ def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarra
     temperature_c : ndarray, shape (n,), optional
         Needed when the calibration has thermal effects.
     thermal_branch : ndarray, shape (n,), optional
-        Thermal branch (`reference.thermal_branch`); zero if not given.
+        Thermal branch (`reference.signal_history`); zero if not given.
     vibration : ndarray, shape (n, 3), optional
-        How much it vibrates (`reference.vibration`), (m/s^2)^2; zero where not given.
+        How much it vibrates (`reference.signal_history`), (m/s^2)^2; zero where not given.
     transfer : Transfer, optional
         Point and frame to move to: ``f_target = f_s - (alpha x r + omega x (omega x r))``.
 

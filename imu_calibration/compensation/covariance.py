@@ -115,9 +115,9 @@ class Uncertainty:
         dt : float
             Temperature above the calibration's reference temperature, K.
         branch : float
-            Thermal branch (`reference.thermal_branch`).
+            Thermal branch (`reference.signal_history`).
         vibration : tuple of 3 floats
-            How much it vibrates (`reference.vibration`), (m/s^2)^2.
+            How much it vibrates (`reference.signal_history`), (m/s^2)^2.
         slope_error : rate_slope.SlopeError, optional
             Error of the derivative; None: noise only.
 

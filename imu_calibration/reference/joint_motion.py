@@ -23,9 +23,9 @@ class JointMotion:
     jerk: np.ndarray
     """Third derivative, rad/s^3, shape (n, n_joints)."""
     thermal_branch: np.ndarray | None = None
-    """Thermal branch at these instants (`reference.thermal_branch`), shape (n,); None: unknown."""
+    """Thermal branch at these instants (`reference.signal_history`), shape (n,); None: unknown."""
     vibration: np.ndarray | None = None
-    """Variance of vibration (`reference.vibration`), (m/s^2)^2, shape (n, 3); None: unknown."""
+    """Variance of vibration (`reference.signal_history`), (m/s^2)^2, shape (n, 3); None: unknown."""
 
     def __len__(self) -> int:
         return len(self.time)

@@ -29,9 +29,9 @@ class Reference:
     temperature_c: np.ndarray | None = None
     """Temperature at the samples, degrees Celsius, shape (n,)."""
     branch: np.ndarray | None = None
-    """Thermal branch at the samples (`reference.thermal_branch`), shape (n,); None: unknown."""
+    """Thermal branch at the samples (`reference.signal_history`), shape (n,); None: unknown."""
     shaking: np.ndarray | None = None
-    """Variance of vibration at the samples (`reference.vibration`), (m/s^2)^2, shape (n, 3); None: unknown."""
+    """Variance of vibration at the samples (`reference.signal_history`), (m/s^2)^2, shape (n, 3); None: unknown."""
     motion: Any = None
     """The joints' motion (`JointMotion`), when there is a table."""
 

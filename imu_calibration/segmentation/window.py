@@ -100,7 +100,7 @@ class PhasedSamples(_Columns):
     thermal_branch: np.ndarray
     """Thermal branch (direction of the temperature change), NaN where it is unknown, shape (n,)."""
     vibration: np.ndarray
-    """Variance of the vibration (`reference.vibration`), (m/s^2)^2, shape (n, 3)."""
+    """Variance of the vibration (`reference.signal_history`), (m/s^2)^2, shape (n, 3)."""
     phase: np.ndarray
     """STILL, STEADY or MOVING, shape (n,)."""
     quiet: np.ndarray

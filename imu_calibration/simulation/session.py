@@ -172,7 +172,7 @@ def temperature_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray |
 
 
 def branch_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray | None:
-    """Return the thermal branch of the warm-up (`reference.thermal_branch`), or None without a temperature topic: it never turns."""
+    """Return the thermal branch of the warm-up (`reference.signal_history`), or None without a temperature topic: it never turns."""
     warmth = temperature_at(time, options)
     return None if warmth is None else np.clip((warmth - options.temperature_start_c) / HALF_WIDTH, -1.0, 1.0)
 
