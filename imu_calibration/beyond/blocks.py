@@ -14,7 +14,7 @@ from imu_calibration.estimation.noise_at_rest import LEAST_NOISE
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.reference_motion import Reference
 from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window, all_samples
+from imu_calibration.segmentation.window import Window, all_samples, chunks
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import Explained
 from imu_calibration.selection.noise_beside_effects import natural_processes
@@ -155,6 +155,11 @@ def _busier(windows, sensor, floor, kinds, judged):
 
 def residuals(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> dict[str, np.ndarray]:
     """Return sensor -> residual of every sample of all windows at some values, shape (n, 3): rows within blocks would be too coarse."""
+    parts = [_residuals(group, table, model, values) for group in chunks(windows)]   # columns take many times the memory of their samples
+    return {sensor: np.concatenate([part[sensor] for part in parts]) for sensor in SENSORS}
+
+
+def _residuals(windows, table, model, values):
     motion, temperature, rows = all_samples(windows)
     predicted = predict(model, values, table, motion=motion, temperature_c=temperature)
     outputs = (np.concatenate([w.force_s for w in windows]), np.concatenate([w.rate_s for w in windows]))

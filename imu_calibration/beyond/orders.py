@@ -24,6 +24,8 @@ MOST = 0.75
 """Share of the windows that must be, more than."""
 SHORTEST_CYCLE = 2.2
 """Samples per cycle, at least."""
+REPEATED = 1e-12
+"""Least variance over the squared mean, and least determinant over the squared trace: less is rounding."""
 FEWEST_SAMPLES = 16
 """Least number of samples of a window, or of equal steps of a turning joint, for a spectrum."""
 
@@ -75,12 +77,16 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     mean = parts.sum(axis=0) / count[:, None, None]
     about = np.einsum('pkxi,pkxj->kxij', parts, parts) - count[:, None, None, None] * np.einsum('kxi,kxj->kxij', mean, mean)
     scatter = about / (count - 1)[:, None, None, None]
+    spread = np.trace(scatter, axis1=-2, axis2=-1)
+    known = (spread > REPEATED * (mean**2).sum(axis=-1)) & (np.linalg.det(scatter) > REPEATED * spread**2)   # repeated data have no scatter
+    scatter[~known], mean[~known] = np.eye(2), 0.0
     t_squared = count[:, None] * np.einsum('kxi,kxi->kx', mean, np.linalg.solve(scatter, mean[..., None])[..., 0])
     degrees = (count - 2)[:, None]
     p_value = f_sf(t_squared * degrees / (2 * (count - 1)[:, None]), 2, degrees)
     wave = sums.sum(axis=0) / weight.sum(axis=0)[:, None]
     power = np.abs(wave)**2
-    return Orders(order, 2 * np.abs(wave), p_value, power / np.median(power, axis=0), _alike(number, sums, weight, wave))
+    usual = np.maximum(np.median(power, axis=0), np.finfo(float).tiny)
+    return Orders(order, 2 * np.abs(wave), p_value, power / usual, _alike(number, sums, weight, wave))
 
 
 def _alike(number, sums, weight, wave):

@@ -195,3 +195,11 @@ def test_a_robot_description_without_its_packages_is_refused_with_the_extra(monk
     path.write_text('<robot name="a"><link name="base"/></robot>')
     with refused(InputError, 'package_missing', 'imu_calibration[arm]'):
         table_from_urdf(files.read_robot_description(path, allow_xacro=True), 'base', {'gravity': 9.8})
+
+
+@pytest.mark.live
+def test_nodes_limit_the_threads_of_numpy_before_it_is_imported():
+    code = "import os, sys, imu_calibration.nodes; print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
+    given = {name: value for name, value in os.environ.items() if name != 'OPENBLAS_NUM_THREADS'}
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, env=given, capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.split() == ['False', '1']

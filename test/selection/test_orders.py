@@ -59,3 +59,13 @@ def test_noise_hum_lags_and_dents_are_no_order(rest_of):
 def test_too_little_motion_tells_nothing():
     windows, rests = swings(lambda k, angle: 0.0, count=1, span=0.01)
     assert orders_of(windows, rests, 0) is None
+
+
+@pytest.mark.parametrize('level', [0.0, 1e-4, 1.0])
+def test_identical_swings_have_no_scatter_and_no_order(level):
+    """Pieces that repeat sample by sample say nothing about the chance of their mean."""
+    windows, rests = swings(lambda k, angle: 0.5 * np.sin(17 * angle + 0.3), count=1)
+    rest = level * rests[0][:200]
+    window = Window(time=TIME[:200], motion=Motion(position=windows[0].motion.position[:200]))
+    orders = orders_of([window] * 10, [rest] * 10, 0)
+    assert np.array_equal(orders.p_value, np.ones_like(orders.p_value))
