@@ -12,6 +12,7 @@ from imu_calibration import files
 from imu_calibration.cli.main import main
 from imu_calibration.cli.show import console
 from imu_calibration.compensation import evaluation
+from imu_calibration.units import error_text, significant
 from imu_calibration.use_cases.recordings import source_of
 
 
@@ -46,7 +47,7 @@ def show(figures):
     for heading in ('', 'accelerometer', 'gyroscope', 'velocity after 50 s', 'position after 50 s'):
         table.add_column(heading, justify='left' if not heading else 'right')
     for name, f in zip(('before', 'after'), figures):
-        table.add_row(name, f'{f.force_mg:.3f} mg', f'{f.rate_deg_s:.5f} deg/s', f'{f.velocity:.3f} m/s', f'{f.position:.2f} m')
+        table.add_row(name, error_text(f.force, 'm/s^2'), error_text(f.rate, 'rad/s'), f'{significant(f.velocity)} m/s', f'{significant(f.position)} m')
     print()
     console().print(table)
 

@@ -10,8 +10,8 @@ _SHOWN = {
     '': {'m/s^2': (1e3 / STANDARD_GRAVITY, 'mg'), 'rad/s': (1 / DEG, 'deg/s'), 'm': (1e3, 'mm'), 'rad': (60 / DEG, 'arcmin'),
          's': (1e3, 'ms'), '(rad/s)^-1': (1e2 * DEG, '% per deg/s'), '(rad/s)/(m/s^2)': (STANDARD_GRAVITY / DEG, '(deg/s)/g'),
          'm/s^2/K': (1e3 / STANDARD_GRAVITY, 'mg/K'), 'rad/s/K': (1 / DEG, '(deg/s)/K'), '1/K': (1e6, 'ppm/K'),
-         'rad/turn': (1 / DEG, 'deg per turn'), 'm/s^2/s': (60e3 / STANDARD_GRAVITY, 'mg/min'), 'rad/s/s': (60 / DEG, '(deg/s)/min'),
-         's/s': (1e6, 'ppm')},
+         'rad/turn': (1 / DEG, 'deg per turn'), 'rad per turn': (1 / DEG, 'deg per turn'), 'm/s^2/s': (60e3 / STANDARD_GRAVITY, 'mg/min'),
+         'rad/s/s': (60 / DEG, '(deg/s)/min'), 's/s': (1e6, 'ppm')},
     'accelerometer': {'(m/s^2)^-1': (1e3 * STANDARD_GRAVITY, 'mg/g²'), '(m/s^2)^-2': (1e3 * STANDARD_GRAVITY**2, 'mg/g³')},
     'gyroscope': {'(m/s^2)^-1': (1e2 * STANDARD_GRAVITY, '% per g'), '(m/s^2)^-2': (1e2 * STANDARD_GRAVITY**2, '% per g²')},
     NOISE: {'m/s^2/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√Hz'), 'm/s^3/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√s'),
@@ -67,3 +67,9 @@ def significant(value: float, digits: int = 3) -> str:
     if not 1e-4 <= abs(value) < 1e6:
         return f'{value:.{digits - 1}e}'
     return f'{value:.{max(0, digits - 1 - int(np.floor(np.log10(abs(value)))))}f}'
+
+
+def error_text(value: float, unit: str, digits: int = 3) -> str:
+    """Return an error figure as it is printed everywhere: in the customary unit of an SI unit, with three significant digits."""
+    factor, shown = for_people(unit)
+    return f'{significant(value * factor, digits)} {shown}'

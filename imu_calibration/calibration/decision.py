@@ -5,7 +5,7 @@ from enum import StrEnum
 from typing import Any
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.units import for_people, significant
+from imu_calibration.units import error_text
 
 HARM = 1.05
 """Factor on the error of a regime from which it is named, where the interval lies above 1 too."""
@@ -61,16 +61,15 @@ def reason_of(entry: Mapping | None) -> str:
     if not entry or not entry['windows']:
         return NO_PROOF
     earlier = entry.get('earlier')
-    more = f', {_error(earlier["after"], entry["unit"])} with the earlier calibration' if earlier else ''
+    more = f', {error_text(earlier["after"], entry["unit"])} with the earlier calibration' if earlier else ''
     cause = OTHER_ATTITUDES if entry.get('one_attitude') else '' if decide(entry) is HELPS else _cause(entry)
-    return (f'error {_error(entry["before"], entry["unit"])} to {_error(entry["after"], entry["unit"])} on held-out data '
-            f'({entry["windows"]} windows, {_ratio(entry)}){more}{cause}')
+    return (f'{_errors(entry, entry["unit"])} on held-out data ({entry["windows"]} windows, {_ratio(entry)}){more}{cause}')
 
 
 def worse_regimes(entry: Mapping) -> list[str]:
     """Return a line for each regime in which the error grows."""
-    return [f'error {_error(part["before"], part.get("unit", entry["unit"]))} to {_error(part["after"], part.get("unit", entry["unit"]))} '
-            f'on held-out data of the regime {name} ({_ratio(part)})' for name, part in harmed(entry).items()]
+    return [f'{_errors(part, part.get("unit", entry["unit"]))} on held-out data of the regime {name} ({_ratio(part)})'
+            for name, part in harmed(entry).items()]
 
 
 def harmed(entry: Mapping) -> dict[str, Any]:
@@ -86,9 +85,8 @@ def helps_everywhere(entry: Mapping | None) -> bool:
     return not any(part['after'] >= part['before'] or part['ci95'][1] >= 1.0 for part in (entry.get('regimes') or {}).values())
 
 
-def _error(value, unit):
-    factor, name = for_people(unit)
-    return f'{significant(value * factor)} {name}'
+def _errors(entry, unit):
+    return f'error {error_text(entry["before"], unit)} to {error_text(entry["after"], unit)}'
 
 
 def _ratio(entry):

@@ -12,7 +12,7 @@ from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.reference.reference_motion import Reference
-from imu_calibration.units import for_people, significant
+from imu_calibration.units import error_text
 
 END, MEAN = 'end of the recording', 'mean of the recording'
 LAST_SHARE = 2.0 / 3.0
@@ -97,8 +97,7 @@ def uncorrected_lines(statistics: Mapping[str, Any]) -> list[str]:
     """Return a line for each effect that compensation replaces by a constant, from the statistics of a document."""
     lines = []
     for entry in statistics.get('uncorrected') or ():
-        factor, unit = for_people(entry['unit'])
-        size = f'{significant(max(entry["rms"]) * factor, 2)} {unit}'
+        size = error_text(max(entry['rms']), entry['unit'])
         lines.append(f'{entry["effect"]} is not corrected: the {entry["sensor"]} bias has its value at the {entry["applied"]}, '
                      f'with an error of {size} rms during the recording')
     return lines

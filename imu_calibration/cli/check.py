@@ -22,6 +22,7 @@ def run(options: Namespace) -> VerbResult:
     """Print the errors before and after with their interval and the decision; exit code 0 when it helps each sensor, otherwise 3."""
     from imu_calibration.cli.show import console, show_table, warn
     from imu_calibration.preflight.checks import warnings
+    from imu_calibration.units import error_text
     from imu_calibration.use_cases.check import check
     found = check(options.bag, options.calibration, stand_of(options), **choices_of(options))
     warn([finding.to_mapping() for finding in warnings(found.result.findings)])
@@ -30,10 +31,10 @@ def run(options: Namespace) -> VerbResult:
     for sensor, entry in found.proof.items():
         for motion, part in (('all', entry), *entry['regimes'].items()):
             low, high = part['ci95']
-            rows.append((sensor, motion, f'{part["seconds"]:.0f}', f'{part["before"]:.4g}', f'{part["after"]:.4g}',
-                          part.get('unit', entry['unit']),
-                          f'{part["after"] / max(part["before"], 1e-300):.3f}', f'{low:.3f} to {high:.3f}'))
-    show_table(out, ('sensor', 'motion', *numbers[:3], 'unit', *numbers[3:]), rows, numbers=numbers)
+            rows.append((sensor, motion, f'{part["seconds"]:.0f}',
+                         *(error_text(part[when], part.get('unit', entry['unit'])) for when in ('before', 'after')),
+                         f'{part["after"] / max(part["before"], 1e-300):.3f}', f'{low:.3f} to {high:.3f}'))
+    show_table(out, ('sensor', 'motion', *numbers), rows, numbers=numbers)
     for line in str(found).splitlines():
         out.print(line, soft_wrap=True, markup=False)
     return VerbResult(found.exit_code, {'proof': found.proof, 'helps': found.helps})

@@ -6,6 +6,7 @@ import math
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from imu_calibration import files
 from imu_calibration.calibration.decision import HARMS, HELPS, UNPROVEN
@@ -16,7 +17,6 @@ from imu_calibration.cli.fleet_units import find_units, unit_of
 from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.parser import VerbResult
 from imu_calibration.cli.show import console, show_table, warn
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError, with_hint
 from imu_calibration.progress import counter
 from imu_calibration.report.calibration_page import calibration_report
@@ -46,12 +46,11 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
     for result in results:
         for name, text in (result.files or {}).items():
             files.write_text(files.make_folder(folder / result.name) / name, text)
-    tables = {'summary.csv': parameters_csv(spreads), 'units.csv': units_csv(results)}
-    for name, text in tables.items():
-        files.write_text(folder / name, text)
+    rows = {'summary.csv': parameter_rows(spreads), 'units.csv': unit_rows(results)}
+    for name, table in rows.items():
+        files.write_text(folder / name, csv_text(table))
     files.write_text(folder / 'summary.html', summary_html(results, spreads))
     show_fleet(results, spreads, folder, hints=hints_of(options))
-    rows = {name: list(csv.DictReader(io.StringIO(text))) for name, text in tables.items()}
     return VerbResult(fleet_exit_code(results), {'units': rows['units.csv'], 'parameters': rows['summary.csv']})
 
 
@@ -74,32 +73,40 @@ def _mapper(options, n_units, done):
     return process_mapper(jobs_for(options.jobs, n_units), done)
 
 
-def parameters_csv(spreads: Sequence[Spread]) -> str:
+def parameter_rows(spreads: Sequence[Spread]) -> list[dict[str, Any]]:
     """Return the summary: one row per parameter, SI."""
-    rows = [(s.name, s.unit, s.count, s.mean, s.spread, s.typical_sd, s.ratio, *s.lowest, *s.highest) for s in spreads]
-    return _csv([HEADINGS, *rows])
+    return [dict(zip(HEADINGS, (s.name, s.unit, s.count, s.mean, s.spread, s.typical_sd, s.ratio, *s.lowest, *s.highest))) for s in spreads]
 
 
-def units_csv(results: Sequence[UnitResult]) -> str:
-    """Return one row per unit: decisions, exit code, reason of a refusal, samples lost, each parameter with its sd, SI."""
+def unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
+    """Return one row per unit: decisions, exit code, reason of a refusal, samples lost, each parameter with its sd, SI; None: unknown."""
     names = list(dict.fromkeys(name for result in results if result.calibration for name in result.calibration.param_names))
     headings = [heading for name in names for heading in (name, f'{name}.sd')]
-    rows: list[list] = [['name', 'decision', *SENSORS, 'exit_code', 'error', 'dropped', *headings]]
+    rows = []
     for result in results:
-        known, dropped = {}, ''
+        known, dropped = {}, None
         if result.calibration is not None:
             known = dict(zip(result.calibration.param_names, zip(result.calibration.values, result.calibration.sd)))
             dropped = sum((result.calibration.statistics.get('dropped') or {}).values())
-        name = f"'{result.name}" if result.name[:1] in '=+-@\t\r' else result.name   # a spreadsheet would calculate it
-        row = [name, result.verdict, *result.verdicts.values(), result.exit_code, result.error, dropped]
-        rows.append(row + [number for name in names for number in known.get(name, ('', ''))])
-    return _csv(rows)
+        row = {'name': result.name, 'decision': result.verdict, **result.verdicts, 'exit_code': result.exit_code, 'error': result.error,
+               'dropped': dropped}
+        rows.append(row | dict(zip(headings, (number for name in names for number in known.get(name, (None, None))))))
+    return rows
 
 
-def _csv(rows):
+def csv_text(rows: Sequence[dict[str, Any]]) -> str:
+    """Return rows as CSV with a heading; unknown values are empty, and text that a spreadsheet would calculate begins with a quote."""
     text = io.StringIO()
-    csv.writer(text, lineterminator='\n').writerows([['' if isinstance(v, float) and math.isnan(v) else v for v in row] for row in rows])
+    written = csv.DictWriter(text, rows[0] if rows else HEADINGS, lineterminator='\n')
+    written.writeheader()
+    written.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
     return text.getvalue()
+
+
+def _cell(value):
+    if isinstance(value, str):
+        return f"'{value}" if value[:1] in tuple('=+-@\t\r') else value
+    return '' if isinstance(value, float) and math.isnan(value) else value
 
 
 def shown(spread: Spread) -> tuple[str, ...]:

@@ -7,7 +7,6 @@ import numpy as np
 
 from imu_calibration.compensation.compensate import FittedErrors
 from imu_calibration.compensation.stream import CompensationStream
-from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.navigation import drift_over
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.reference_motion import Reference
@@ -31,10 +30,10 @@ class SessionTruth:
 class ErrorFigures:
     """Errors of one version of the samples."""
 
-    force_mg: float
-    """Root mean square error of specific force over one-second means, per axis, mg."""
-    rate_deg_s: float
-    """The same of the rate, deg/s."""
+    force: float
+    """Root mean square error of specific force over one-second means, per axis, m/s^2."""
+    rate: float
+    """The same of the rate, rad/s."""
     velocity: float
     """Median velocity error after dead reckoning, m/s."""
     position: float
@@ -70,8 +69,7 @@ def error_figures(truth: SessionTruth, force_s: np.ndarray, rate_s: np.ndarray, 
     period = float(np.median(np.diff(reference.time)))
     length = max(int(round(1.0 / period)), 1)
     drift = drift_over(reference, force_s, rate_s, seconds=seconds)
-    return ErrorFigures(_rms_of_means(force_s - reference.force_s, length) / STANDARD_GRAVITY * 1e3,
-                        _rms_of_means(rate_s - reference.rate_s, length) / DEG,
+    return ErrorFigures(_rms_of_means(force_s - reference.force_s, length), _rms_of_means(rate_s - reference.rate_s, length),
                         float(np.median(drift.velocity)), float(np.median(drift.position)))
 
 

@@ -27,7 +27,7 @@ from imu_calibration.effects.named_models import BARE
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.reference.table import Table
 from imu_calibration.selection.investigation import too_few_windows
-from imu_calibration.units import for_people, significant
+from imu_calibration.units import error_text
 
 MUCH = 100.0
 """Held-out gain of log likelihood from which a refused effect is reported, nats."""
@@ -238,5 +238,4 @@ def nothing_named(diagnosis: Diagnosis) -> str:
 
 def in_words(value: float, sensor: str, unit: str | None = None) -> str:
     """Return a specific force or rate, or a value in another unit, in people's units."""
-    factor, unit = for_people(unit or UNIT[sensor])
-    return f'{significant(value * factor)} {unit}'
+    return error_text(value, unit or UNIT[sensor])

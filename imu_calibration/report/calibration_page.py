@@ -5,12 +5,9 @@ from typing import Any
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.trust import usage
-from imu_calibration.calibration.window_errors import WindowErrors
-from imu_calibration.effects.base import SENSORS, UNIT
 from imu_calibration.report.budget_section import budget_section
 from imu_calibration.report.geometry import derived_section, lever_section
 from imu_calibration.report.navigation_section import navigation_section
-from imu_calibration.report.numbers import in_unit
 from imu_calibration.report.observability_section import observability_section
 from imu_calibration.report.origin import origin_section, recording_facts
 from imu_calibration.report.page import render
@@ -18,6 +15,7 @@ from imu_calibration.report.parameters import parameter_groups
 from imu_calibration.report.proof_section import proof_section
 from imu_calibration.report.readings import reading_tables
 from imu_calibration.report.residuals import residual_section
+from imu_calibration.units import error_text
 
 
 def calibration_report(result: CalibrationResult) -> str:
@@ -35,20 +33,20 @@ def calibration_report(result: CalibrationResult) -> str:
     at_rest, moving = reading_tables(result, errors)
     navigation = navigation_section(result, errors)
     return render('calibration.html', title='IMU calibration', verdict=result.verdict, usage=usage(result.calibration),
-                  facts=recording_facts(result), proof=proof_section(result.calibration), tiles=tiles(result, errors, navigation),
+                  facts=recording_facts(result), proof=proof_section(result.calibration), tiles=tiles(result, navigation),
                   groups=parameter_groups(result),
                   derived=derived_section(result), residuals=residual_section(result, errors),
                   observability=observability_section(result), levers=lever_section(result), navigation=navigation, at_rest=at_rest,
                   moving=moving, budget=budget_section(result), origin=origin_section(result), observations=result.observations)
 
 
-def tiles(result: CalibrationResult, errors: WindowErrors, navigation: dict[str, Any]) -> list[dict[str, str | None]]:
+def tiles(result: CalibrationResult, navigation: dict[str, Any]) -> list[dict[str, str | None]]:
     """Return the main figures: the determined parameters, and the errors before and after."""
     asked = list(result.calibration.requested.values())
     found = [_tile('parameters determined', f'{asked.count(DETERMINED)} of {len(asked)}', None, 'to their tolerances')]
-    for sensor in SENSORS:
-        after, before = (in_unit(errors.rms(sensor, which), UNIT[sensor]) for which in ('after', 'before'))
-        found.append(_tile(f'{sensor} error', after, before, f'rms of {len(errors.time)} window means'))
+    for sensor, entry in result.calibration.proof.items():
+        after, before = (error_text(entry[which], entry['unit']) for which in ('after', 'before'))
+        found.append(_tile(f'{sensor} error on held-out data', after, before, f'{entry["windows"]} windows'))
     if navigation['rest']:
         after, before = navigation['rest']['position'][::-1]
         found.append(_tile('position error after 50 s at rest', f'{after} m', f'{before} m',

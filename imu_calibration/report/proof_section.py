@@ -2,7 +2,7 @@
 
 from imu_calibration.calibration.decision import harmed
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.units import for_people, significant
+from imu_calibration.units import error_text
 
 
 def proof_section(calibration: Calibration) -> list[dict[str, str | bool]]:
@@ -11,8 +11,7 @@ def proof_section(calibration: Calibration) -> list[dict[str, str | bool]]:
     for sensor, found in calibration.proof.items():
         worse = harmed(found)
         for motion, part in (('all', found), *(found.get('regimes') or {}).items()):
-            factor, unit = for_people(found['unit'])
-            before, after = (f'{significant(part[name] * factor)} {unit}' for name in ('before', 'after'))
+            before, after = (error_text(part[name], part.get('unit', found['unit'])) for name in ('before', 'after'))
             low, high = part['ci95']
             much = f'{part["seconds"]:.0f} s' if 'seconds' in part else f'{found["windows"]}'
             rows.append({'sensor': sensor, 'motion': motion, 'much': much, 'before': before, 'after': after,

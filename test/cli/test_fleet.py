@@ -10,7 +10,7 @@ from refusal import refused
 
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.fleet import UnitResult, summarise
-from imu_calibration.cli.fleet_run import summary_html, units_csv
+from imu_calibration.cli.fleet_run import summary_html, unit_rows
 from imu_calibration.cli.main import main
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError
@@ -103,8 +103,9 @@ def test_the_summary_is_that_of_the_units(result):
 def test_a_unit_has_the_word_of_each_sensor(result):
     known = read_calibration(result[1] / 'unit_a' / 'calibration.yaml')
     unit = UnitResult('unit_d', replace(known, decision={'accelerometer': 'harms', 'gyroscope': 'helps'}), 'harms')
-    row = next(iter(csv.DictReader(units_csv([unit]).splitlines())))
+    row = unit_rows([unit])[0]
     assert (row['decision'], row['accelerometer'], row['gyroscope']) == ('harms', 'harms', 'helps')
+    assert isinstance(row['exit_code'], int) and all(isinstance(value, float) for name, value in row.items() if '.' in name)
     page = summary_html([unit], summarise([unit]))
     assert 'accelerometer harms, gyroscope helps' in page and '<span class="tag harms">' in page
 

@@ -16,7 +16,7 @@ from refusal import refused as expected
 from imu_calibration.by_hand.sample_store import HandStore
 from imu_calibration.calibration.accumulator_state import saved_model
 from imu_calibration.calibration.document import calibration_to_text
-from imu_calibration.cli.fleet_run import units_csv
+from imu_calibration.cli.fleet_run import csv_text, unit_rows
 from imu_calibration.documents import from_text
 from imu_calibration.errors import DocumentError, InputError
 from imu_calibration.exports.export import export, find_target
@@ -121,7 +121,7 @@ def test_a_name_is_neither_a_formula_nor_mathematics(tmp_path):
         figure.add_subplot().set_title('$\\bad{$')
     assert 'bad' in draw('x', (2, 2), paint, label='x')
     result = UnitResult('=cmd|calc!A1')
-    assert list(csv.reader(units_csv([result]).splitlines()))[1][0] == "'=cmd|calc!A1"
+    assert list(csv.reader(csv_text(unit_rows([result])).splitlines()))[1][0] == "'=cmd|calc!A1"
 
 
 class UnitResult:

@@ -74,5 +74,5 @@ def test_compensated_bag(output, tmp_path):
     with open_recording(BAG) as recording:
         raw = session_truth(recording.blocks(table.joint_names), table)
     before, after = before_and_after(raw, load(output / 'calibration.yaml'))
-    print(f'sample session: {before.force_mg:.2f} -> {after.force_mg:.3f} mg, {before.rate_deg_s:.3f} -> {after.rate_deg_s:.5f} deg/s')
-    assert after.force_mg < 0.1 * before.force_mg and after.rate_deg_s < 0.1 * before.rate_deg_s
+    print(f'sample session: {before.force} -> {after.force} m/s^2, {before.rate} -> {after.rate} rad/s')
+    assert after.force < 0.1 * before.force and after.rate < 0.1 * before.rate
