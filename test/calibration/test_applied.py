@@ -83,18 +83,18 @@ def test_the_proof_from_statistics_of_windows_differs_from_that_of_readings_by_t
         assert found[sensor]['after'] == pytest.approx(entry['after'], rel=0.02)
 
 
-def drifting(seconds=560.0, size=0.5 * DEG, time_constant=100.0):
-    """Return (samples, table, bias at the end, bias at the start) of a session whose gyroscope bias drifts by `size` on each axis."""
-    session = imu.simulate('calibration', seed=7, duration=seconds, imu_rate=50.0)
+def drifting(size=0.5 * DEG, time_constant=35.0):
+    """Return (samples, table, bias at the end, bias at the start, duration in s) of a session whose gyroscope bias drifts by `size` on each axis."""
+    session = imu.simulate('random_short', seed=7, imu_rate=50.0)
     time = 1e-9 * (session.samples.imu.stamp_ns - session.samples.imu.stamp_ns[0])
     course = -size * np.expm1(-time / time_constant)
     bias = session.truth.value('gyroscope', 'bias')
     moved = replace(session.samples, imu=replace(session.samples.imu, rate_s=session.samples.imu.rate_s + course[:, None]))
-    return moved, session.table, bias + course[-1], bias
+    return moved, session.table, bias + course[-1], bias, time[-1]
 
 
 def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third():
-    samples, table, at_end, at_start = drifting()
+    samples, table, at_end, at_start, duration = drifting()
     calibration = imu.calibrate(samples, table).calibration
     bias, sd = calibration.value('gyroscope', 'bias'), calibration.sd[calibration.model.slices['gyroscope', 'bias']]
     assert np.all(np.abs(bias - at_end) < 5 * sd) and np.all(sd < 0.05 * DEG) and np.all(np.abs(bias - at_start) > 0.4 * DEG)
@@ -108,7 +108,7 @@ def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third
     assert calibration.proof['gyroscope']['after'] < 0.2 * DEG
     again = calibration_from_text(calibration_to_text(calibration))
     np.testing.assert_array_equal(again.model.centre['gyro_warm_up'], calibration.model.centre['gyro_warm_up'])
-    ref_start, ref_end = (model_output(again, time) for time in (0.0, 560.0))
+    ref_start, ref_end = (model_output(again, time) for time in (0.0, duration))
     np.testing.assert_allclose(ref_end, bias, atol=1e-3 * DEG)
     np.testing.assert_allclose(ref_start - ref_end, at_start - at_end, atol=0.1 * DEG)
 

@@ -135,7 +135,7 @@ def test_the_turns_tell_apart_what_is_one_to_the_norm():
     assert alone.sd_of('accelerometer.accel_cross_product.x_yz') > 10 * result.hand.sd_of('accelerometer.accel_cross_product.x_yz')
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nothing_hidden_nothing_found():
     """Poses and biases that scatter from pose to pose are no effect: at most one finding in 14 recordings (none in 24 during development)."""
     named = [[f.effect for f in diagnosed(seed, pose_sd=0.002, drift_sd=2e-4, n_poses=20).diagnosis.findings] for seed in range(40, 54)]

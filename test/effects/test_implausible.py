@@ -20,7 +20,7 @@ NAMES = [f'accelerometer.accel_cubic.{axis}' for axis in 'xyz']
 @pytest.fixture(scope='module')
 def strange():
     """A session with such a cubic term, and its table."""
-    session = physics.make_session(41, {'accel_cubic': CUBIC}, profile='random_short')
+    session = physics.make_session(41, {'accel_cubic': CUBIC}, profile='quick')
     return session.block, Table.from_mapping(session.table)
 
 
