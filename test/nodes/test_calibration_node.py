@@ -166,10 +166,10 @@ def test_poses_by_hand_through_the_node(tmp_path):
 
 def check_by_hand(bag, folder, rate, gravity=None):
     """Play a bag to a node without a table."""
+    from sensor_msgs.msg import Imu
     options = {'table_file': '', 'gravity': gravity or 0.0}
     with Station() as station:
         documents, residuals = station.watch_documents(), station.watch_imu('imu/residual')
-        corrected = station.watch_imu('imu/data_corrected')
         station.watch_diagnostics()
         node = station.calibration_node(folder, **options)
         station.start('compensator_node')
@@ -187,8 +187,14 @@ def check_by_hand(bag, folder, rate, gravity=None):
         free = expected.sd > 0
         assert np.max(np.abs(live.values - expected.values)[free] / expected.sd[free]) < 1e-6
         check_the_poses(station, expected)
-        assert documents and len(taken(residuals)) >= 1 and len(taken(corrected)) > 100   # the compensator takes the document as it is
+        assert documents and len(taken(residuals)) >= 1
         resumed(station, node, folder, options, live)
+        # On a busy machine the recording is over before the compensator has a document: it is played again.
+        corrected = []
+        station.subscriptions.append(station.node.create_subscription(Imu, 'imu/data_corrected', corrected.append, 1000))
+        player = station.play(bag, rate, subscribers=2)
+        station.until(lambda: len(corrected) > 100, 'corrected messages')
+        station.processes.end(player)
 
 
 def check_the_poses(station, expected):

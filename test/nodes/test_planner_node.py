@@ -329,17 +329,17 @@ def test_a_class_that_the_six_faces_leave_is_driven_apart_and_a_node_that_ends_l
     from imu_calibration.nodes.qos import latched_qos
     with Loop(tmp_path / 'out.txt') as loop:
         # A finding that joins the calibration widens what it is mixed up with, and the motions for that part the class on their way.
-        loop.begin(tmp_path, {'stall_patience': 30.0, 'silence': 10.0}, {'model_as_asked': True}, profile='six_faces', hide='soft_spring', hide_size=1.8, seed=1, time_factor=8.0,
+        loop.begin(tmp_path, {'stall_patience': 30.0, 'silence': 10.0, 'first_speed': 0.1}, {'model_as_asked': True}, profile='six_faces', hide='soft_spring', hide_size=1.8, seed=1, time_factor=8.0,
                    wait_for_subscribers=1)
         places, words = [], []
         loop.node.create_subscription(MarkerArray, 'imu/coverage', lambda m: words.extend(each.text for each in m.markers if each.ns == 'driven' and each.text),
                                       latched_qos())
         loop.node.create_subscription(JointState, 'joint_states', lambda m: places.append((m.header.stamp.sec, *m.position)), 1000)
-        loop.until(lambda: places and places[-1][0] > 1.8e9 + 64, 'the end of the six faces', 60.0)
+        loop.until(lambda: places and places[-1][0] > 1.8e9 + 64, 'the end of the six faces')
         # What the planner knows is all that came: it drives nothing before it asks, and the class does not depend on how busy the machine is.
         assert loop.call('/calibration_node/solve').message.startswith('helps')
         loop.ask('start')
-        loop.until(lambda: loop.told('separating') == 'True' and loop.value('state') == 'moving', 'the separating motion', 120.0)
+        loop.until(lambda: loop.told('separating') == 'True' and loop.value('state') == 'moving', 'the separating motion')
         assert {loop.value('found').split()[-1], *loop.value('mates').split()} == {'accel_quadratic', 'accel_scale_asymmetry'}
         assert loop.value('separations') == '1'
         loop.until(lambda: words and words[-1].startswith(f'motion {loop.value("motion")}: go to'), 'the picture of the motion')

@@ -18,7 +18,7 @@ from ros.live_station import STAY_LOCAL, TABLE, free_domain  # noqa: E402
 from ros.workspace import ROOT, build, sourced, with_ros2  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.live]
-PATIENCE = 90.0
+PATIENCE = 240.0
 PLANNER = '/planner_node/'
 """What is asked of who drives; without a table it answers why nothing moves."""
 ANSWERS = {'/calibration_node/solve': 'success=True', '/calibration_node/save': '/ws/calibration.yaml', '/calibration_node/reset': 'restarted',

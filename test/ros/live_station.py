@@ -13,7 +13,7 @@ from msg_adapters.live import LiveGatherer
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / 'config' / 'table_simulated.yaml'
-PATIENCE = 90.0
+PATIENCE = 240.0
 """Seconds after which a test gives up; a busy machine needs some of them."""
 STAY_LOCAL = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
