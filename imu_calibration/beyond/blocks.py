@@ -1,7 +1,7 @@
 """The residual of one sensor in short blocks, with the columns of all candidate effects: data for regimes and formulas."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -24,6 +24,8 @@ BLOCK = 0.25
 """Least length of a block of a moving window, s; at rest a window is one block."""
 MOST_BLOCKS = 1200
 """Blocks of one recording, about: their full covariance is factored."""
+AT_A_TIME = 256
+"""Blocks whose columns are in memory at once."""
 WITHIN = 5
 """Rows at which the columns of a block are evaluated."""
 
@@ -60,8 +62,7 @@ class RestBlocks:
 
     def means(self, rows: np.ndarray) -> np.ndarray:
         """Return means over the blocks of something known at the rows, shape (b, ...)."""
-        counts = np.diff(np.append(self.starts, len(rows)))
-        return np.add.reduceat(rows, self.starts, axis=0) / counts.reshape(-1, *[1] * (rows.ndim - 1))
+        return _means(rows, self.starts)
 
     def whitener(self, select: np.ndarray) -> 'BlockWhitener':
         """Return the whitener of the blocks `select` (mask): independent, of unit variance."""
@@ -115,6 +116,7 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
               'time': np.concatenate([part.means(w.time) for w, part in zip(windows, parts)]),
               'window': number, 'locked': attempt.locked[number]}
     references = References(attempt.recording.model, table, motion, temperature_c=temperature)
+    columns_of = _block_means(attempt, table, motion, temperature, common['starts'])
     found, edges = {}, np.concatenate([part.edges[:-1] + first for part, first in zip(parts, np.cumsum([0, *map(len, windows[:-1])]))])
     for sensor, residual in residuals(windows, table, attempt.recording.model, values=attempt.recording.values).items():
         mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
@@ -123,7 +125,10 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
         variance = floor.low_variance * busier[place] / count[:, None]
         # An estimated bias process would absorb a step or a warm-up; regimes are searched with the least bias processes.
         processes = natural_processes(floor, attempt.recording.period)
-        found[sensor] = _of_sensor(sensor, attempt, references, table, mean, common, variance, processes)
+        rows = np.concatenate([columns_of[sensor], mean], axis=1)
+        design = tuple(rows @ join for join in attempt.space.join[sensor])
+        found[sensor] = RestBlocks(sensor, references.at(sensor), **common, design=design, index=tuple(attempt.space.index[sensor]),
+                                   variance=variance, processes=processes)
     return found
 
 
@@ -166,16 +171,25 @@ def _residuals(windows, table, model, values):
     return {sensor: output - made[rows] for sensor, output, made in zip(SENSORS, outputs, predicted)}
 
 
-def _of_sensor(sensor, attempt, references, table, residual, common, variance, processes):
-    recording, space = attempt.recording, attempt.space
-    ref = references.at(sensor)
-    taken = [columns(recording.model, sensor, table, motion=references.motion, temperature_c=references.temperature_c,
-                     references=references),
-             *(entry.columns(ref) for entry in recording.bank[sensor])]
-    blocks = RestBlocks(sensor, ref, **common, design=(), index=(), variance=variance, processes=processes)
-    rows = np.concatenate([blocks.means(np.concatenate(taken, axis=1)), residual], axis=1)
-    design = tuple(rows @ join for join in space.join[sensor])
-    return replace(blocks, design=design, index=tuple(space.index[sensor]))
+def _block_means(attempt, table, motion, temperature, starts):
+    """Return sensor -> means of all columns over the blocks, shape (b, p): some blocks at a time, as their columns need much memory."""
+    recording, found, edges = attempt.recording, {sensor: [] for sensor in SENSORS}, np.append(starts, len(motion))
+    for first in range(0, len(starts), AT_A_TIME):
+        own = edges[first:first + AT_A_TIME + 1]
+        rows = slice(own[0], own[-1])
+        warmth = None if temperature is None else temperature[rows]
+        references = References(recording.model, table, motion.select(rows), temperature_c=warmth)
+        for sensor in SENSORS:
+            taken = [columns(recording.model, sensor, table, motion=references.motion, temperature_c=warmth, references=references),
+                     *(entry.columns(references.at(sensor)) for entry in recording.bank[sensor])]
+            found[sensor].append(_means(np.concatenate(taken, axis=1), own[:-1] - own[0]))
+    return {sensor: np.concatenate(parts) for sensor, parts in found.items()}
+
+
+def _means(rows, starts):
+    """Return means over the blocks that begin at `starts`, shape (b, ...)."""
+    counts = np.diff(np.append(starts, len(rows)))
+    return np.add.reduceat(rows, starts, axis=0) / counts.reshape(-1, *[1] * (rows.ndim - 1))
 
 
 @dataclass(frozen=True, eq=False)

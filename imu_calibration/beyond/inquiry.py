@@ -74,6 +74,11 @@ class Examination(Investigation):
             self._proposals[sensor] = propose(self.blocks[sensor], self.attempt, fits) if clear else None
         return self._proposals[sensor]
 
+    def free(self) -> None:
+        """Free the blocks and their fits; they are computed again on demand."""
+        self.__dict__.pop('blocks', None)
+        self._fits.clear()
+
     def without(self, gone: Sequence[Question]) -> 'Examination':
         """Return the Examination without some findings; they remain doubtful, and widen the uncertainty of all other ones."""
         names = {question.name for question in gone}

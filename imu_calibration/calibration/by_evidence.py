@@ -115,6 +115,10 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
         return EvidentSolution(*first)
     baseline = baseline_model(options, table, solution.model)
     found, *others = (inquire(windows, table, baseline, progress=asking, bias_processes=options.bias_processes) for windows in parts)
+    for each in (found, *others):
+        each.free()   # the solutions below need that memory
+    if asking:
+        asking(1.0)
     found, more = _without_faint(found, solution), _named_elsewhere(found, others)
     added, point = (), {}
     while beyond := _beyond((*found.adopted, *more), first[2]):

@@ -1,5 +1,9 @@
 """The triangular factor of rows: an exact summary of any number of them for least squares."""
 
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Sequence
+
 import numpy as np
 from scipy.linalg import lapack
 
@@ -21,6 +25,46 @@ def triangular(rows: np.ndarray) -> np.ndarray:
         factor, _, _, info = lapack.dtpqrt(0, min(PANEL, width), factor, block, overwrite_a=1, overwrite_b=1)
         _require_finite(info, factor)
     return np.triu(factor)
+
+
+@dataclass(frozen=True, eq=False)
+class PackedFactor:
+    """A triangular factor without the zeros below its diagonal: half the memory of a square one."""
+
+    shape: tuple[int, int]
+    """Rows and columns."""
+    values: np.ndarray
+    """Elements on and above the diagonal, row by row."""
+
+    @classmethod
+    def of(cls, factor: np.ndarray) -> 'PackedFactor':
+        """Return an upper triangular (or trapezoidal) factor packed."""
+        rows, width = factor.shape
+        return cls((rows, width), factor.ravel()[_places(width)[:_size(rows, width)]])
+
+    def unpacked(self) -> np.ndarray:
+        """Return the factor, shape (k, n)."""
+        return unpacked([self])[0]
+
+
+def unpacked(factors: Sequence[PackedFactor]) -> np.ndarray:
+    """Return factors of n columns and at most k rows in one array, shape (m, k, n); missing rows are zero."""
+    rows, width = max(factor.shape[0] for factor in factors), factors[0].shape[1]
+    found, places = np.zeros((len(factors), rows * width)), _places(width)
+    for row, factor in zip(found, factors):
+        row[places[:len(factor.values)]] = factor.values
+    return found.reshape(len(factors), rows, width)
+
+
+def _size(rows, width):
+    """Return the number of elements on and above the diagonal."""
+    return rows * width - rows * (rows - 1) // 2
+
+
+@lru_cache(maxsize=8)
+def _places(width):
+    """Return the positions of the upper triangle in a flat square matrix; those of its first rows come first."""
+    return np.flatnonzero(np.triu(np.ones((width, width), bool)))
 
 
 def _r_factor(stacked):

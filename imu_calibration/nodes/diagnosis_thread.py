@@ -103,8 +103,10 @@ class DiagnosisThread:
             self._thread.join(timeout)
 
     def _go_on(self, session):
+        """End a diagnosis that nobody waits for; otherwise return the memory that its last step freed."""
         if self._ending or session != self._session:
             raise _Ended
+        return_freed_memory()
 
     def end(self, timeout: float = 10.0) -> None:
         """Cancel the diagnosis, and wait for the thread."""

@@ -14,9 +14,12 @@ from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, s
 from imu_calibration.estimation.shrinkage import SURE
 from imu_calibration.selection.normal_matrices import white_means, within_of_axis
 from imu_calibration.selection.parameter_space import ParameterSpace
+from imu_calibration.selection.recent import Recent
 
 LEAST_WINDOWS = 8
 """Least number of windows for held-out folds."""
+MOST_FITS = 128
+"""Fits kept with their covariances: a search tries thousands of choices, and asks for the last again."""
 FOLDS = 6
 """Parts that are held out in turn."""
 LEAST_SCATTER = 20
@@ -57,7 +60,7 @@ class Evidence(ABC):
 
     def __init__(self, prior_sd: np.ndarray, prior_mean: np.ndarray):
         self._prior = {'prior_sd': prior_sd, 'prior_mean': prior_mean}
-        self._fits: dict[tuple, tuple] = {}
+        self._fits: dict[tuple, tuple] = Recent(MOST_FITS)
         self._losses: dict[tuple, float] = {}
         self._predictions: dict[tuple, np.ndarray] = {}
 

@@ -114,10 +114,12 @@ def _with_moving_factors(space, sensor, noise, values, look_along):
         for axis in range(3):
             reduced = np.append(-values[space.index[sensor][axis]], 1.0)
             if look_along:
-                products = space.within_each(sensor, axis, rows)
-                products[:, :, -1] = products @ reduced
-                variances[axis] = (reduced @ products[:, :, -1].T).sum() / dof
-                squares, rank = misfit_along(products)
+                squares, rank = 0.0, 0
+                for products in space.within_each(sensor, axis, rows):
+                    products[:, :, -1] = products @ reduced
+                    variances[axis] += (reduced @ products[:, :, -1].T).sum() / dof
+                    misfit, dimensions = misfit_along(products)
+                    squares, rank = squares + misfit, rank + dimensions
                 along[axis] = squares / max(rank, 1)
             else:
                 variances[axis] = reduced @ space.within_sum(sensor, axis, rows) @ reduced / dof

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Sequence
+from typing import Iterator, Sequence
 
 import numpy as np
 
@@ -66,44 +66,50 @@ class ParameterSpace:
         """Sensor -> mean rows of the windows for each axis, shape (k, q_a + 1)."""
         return {sensor: [self.recording.mean(sensor) @ join for join in self.join[sensor]] for sensor in SENSORS}
 
-    def within_each(self, sensor: str, axis: int, rows: np.ndarray, *, part: str | None = None) -> np.ndarray:
-        """
-        Return the products of the centred rows of each of the windows `rows` (mask), shape (k, q_a + 1, q_a + 1).
-
-        `part` 'within' or 'slow'; default: the part in use on that axis.
-        """
-        slow_only = part is None and self.slow_only[sensor][axis]
-        products = self.recording.products_of(sensor, 'slow' if slow_only else part or 'within')[rows]
-        return self._joined(sensor, axis, products, self._missing(sensor, axis)[rows] if slow_only else 0.0)
+    def within_each(self, sensor: str, axis: int, rows: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield the products of the centred rows of the windows `rows` (mask), some windows at a time, shape (m, q_a + 1, q_a + 1)."""
+        missing, join = self._missing(sensor, axis), self.join_within[sensor][axis]
+        for some, factors in self.recording.factors_of(sensor, self._compared(sensor, axis), rows):
+            found = join.T @ (factors.transpose(0, 2, 1) @ factors @ join)
+            found[:, -1, -1] += missing[some]
+            yield found
 
     def within_sum(self, sensor: str, axis: int, rows: np.ndarray, *, part: str | None = None) -> np.ndarray:
-        """Return the sum of `within_each`, shape (q_a + 1, q_a + 1)."""
-        slow_only, recording = part is None and self.slow_only[sensor][axis], self.recording
+        """
+        Return the sum of `within_each`, shape (q_a + 1, q_a + 1).
+
+        `part` 'within' or 'slow'; default: the part that is compared on this axis.
+        """
+        join = self.join_within[sensor][axis]
+        found = join.T @ self.recording.product_sum(sensor, part or self._compared(sensor, axis), rows) @ join
         if part is None:
-            total = np.tensordot(rows.astype(float), recording.products_of(sensor, 'slow' if slow_only else 'within'), 1)
-        else:   # once per axis: not worth the memory
-            total = recording.product_sum(sensor, part, rows)
-        return self._joined(sensor, axis, total[None], self._missing(sensor, axis)[rows].sum() if slow_only else 0.0)[0]
+            found[-1, -1] += self._missing(sensor, axis)[rows].sum()
+        return found
 
     def slopes_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
         """Return the products of the centred rows of each window with themselves times `weights` (q_a + 1,), shape (k, q_a + 1)."""
-        join = self.join_within[sensor][axis]
-        return self.recording.products_of(sensor, 'slow' if self.slow_only[sensor][axis] else 'within') @ (join @ weights) @ join
+        join, recording = self.join_within[sensor][axis], self.recording
+        found = np.zeros((len(recording.kind), join.shape[1]))
+        for some, factors in recording.factors_of(sensor, self._compared(sensor, axis), recording.moving):
+            found[some] = ((factors @ (join @ weights))[:, None] @ factors)[:, 0] @ join
+        return found
 
     def squares_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
         """Return the sum of squares of the centred rows of each window times its `weights` (k, q_a + 1), shape (k,)."""
-        columns = weights @ self.join[sensor][axis].T
-        return np.maximum(np.einsum('kij,ki,kj->k', self.recording.products_of(sensor, 'within'), columns, columns, optimize=True), 0.0)
-
-    def _joined(self, sensor, axis, products, missing):
-        """Return products with the columns of an axis, and with the squares that replace the fast part."""
-        join = self.join_within[sensor][axis]
-        found = join.T @ (products @ join)
-        found[:, -1, -1] += missing
+        columns, recording = weights @ self.join[sensor][axis].T, self.recording
+        found = np.zeros(len(columns))
+        for some, factors in recording.factors_of(sensor, 'within', recording.moving):
+            found[some] = ((factors @ columns[some, :, None])**2).sum(axis=(1, 2))
         return found
 
+    def _compared(self, sensor, axis):
+        """Return which part of the centred rows is compared on an axis."""
+        return 'slow' if self.slow_only[sensor][axis] else 'within'
+
     def _missing(self, sensor, axis):
-        """Return the squares that replace the fast part of each window, shape (k,)."""
+        """Return the squares that replace the fast part of each window, zero where that part is compared, shape (k,)."""
+        if not self.slow_only[sensor][axis]:
+            return np.zeros(len(self.recording.count))
         return self.slow_variance[sensor][axis] * np.maximum(self.recording.count - np.maximum(self.recording.slow_rows, 1), 0.0)
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Callable, Sequence
+from typing import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -12,10 +12,19 @@ from imu_calibration.effects.forward_equations import all_arms, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, restricted_window, selected_columns
 from imu_calibration.estimation.noise_model import sessions_of
+from imu_calibration.estimation.triangular import PackedFactor, unpacked
 from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_windows
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window, chunks
+from imu_calibration.selection.recent import Recent
 from imu_calibration.selection.time_constant_bank import BankEntry
+
+PARTS = ('within', 'slow')
+"""Triangular factors of a window: of all centred rows, and of the means of short pieces."""
+BATCH = 32
+"""Windows whose factors are unpacked at a time."""
+MOST_SUMS = 32
+"""Sums of products kept: the folds of every kind of window, for the next axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +38,9 @@ class ReducedRecording:
     bank: dict[str, list[BankEntry]]
     """Sensor -> effects with a time constant, at each of a bank; their columns are last."""
     windows: tuple[WindowStatistics, ...]
-    """Reduced as for a calibration, kept one by one."""
+    """Reduced as for a calibration, kept one by one, without their triangular factors."""
+    factors: dict[tuple[str, str], list[PackedFactor]]
+    """(sensor, one of `PARTS`) -> triangular factor of the centred rows ``[columns | output]`` of each window."""
     describe: dict[str, np.ndarray]
     """Window means of variables that a residual may depend on: 'time', 'temperature', joint angles, rates; each (k,)."""
 
@@ -82,30 +93,45 @@ class ReducedRecording:
         """Return the mean rows ``[columns | residual]``, shape (k, p + 3)."""
         return self._with_residual(sensor, np.array([window.sensors[sensor].mean for window in self.windows]))
 
-    def products_of(self, sensor: str, part: str) -> np.ndarray:
-        """Return the products of the centred rows ``[columns | residual]`` of each window, shape (k, p + 3, p + 3)."""
-        if (sensor, part) not in self._products:
-            width = len(self.windows[0].sensors[sensor].mean)
-            found = self._products[sensor, part] = np.zeros((len(self.windows), width, width))   # windows at rest have zeros
-            for k, rows in self._centred(sensor, part, self.moving):
-                np.matmul(rows.T, rows, out=found[k])
-        return self._products[sensor, part]
+    def factors_of(self, sensor: str, part: str, rows: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """
+        Yield the triangular factors of the centred rows ``[columns | residual]``, of some windows at a time.
+
+        Factors of all windows, and their products even more, would take several times the memory of the samples.
+
+        Parameters
+        ----------
+        sensor : str
+        part : str
+            One of `PARTS`.
+        rows : array, shape (k,)
+            Mask of the windows; those at rest have no factor.
+
+        Yields
+        ------
+        tuple
+            Indices of the windows, shape (m,), and their factors, shape (m, r, p + 3); missing rows are zero.
+
+        """
+        chosen = np.flatnonzero(rows & self.moving)
+        for at in range(0, len(chosen), BATCH):
+            some = chosen[at:at + BATCH]
+            yield some, self._with_residual(sensor, unpacked([self.factors[sensor, part][k] for k in some]))
 
     def product_sum(self, sensor: str, part: str, rows: np.ndarray) -> np.ndarray:
-        """Return the sum of `products_of` over the windows `rows` (mask) without keeping them, shape (p + 3, p + 3)."""
-        width = len(self.windows[0].sensors[sensor].mean)
-        return sum((each.T @ each for _, each in self._centred(sensor, part, rows & self.moving)), np.zeros((width, width)))
+        """Return the products of the centred rows ``[columns | residual]`` of the windows `rows` (mask), summed, shape (p + 3, p + 3)."""
+        key = sensor, part, rows.tobytes()
+        if key not in self._sums:
+            width = len(self.windows[0].sensors[sensor].mean)
+            total = self._sums[key] = np.zeros((width, width))
+            for _, factors in self.factors_of(sensor, part, rows):
+                stacked = factors.reshape(-1, width)
+                total += stacked.T @ stacked
+        return self._sums[key]
 
     @cached_property
-    def _products(self):
-        return {}
-
-    def _centred(self, sensor, part, rows):
-        """Yield (number, triangular factor of the centred rows with the residual) of the windows `rows` (mask)."""
-        for k in np.flatnonzero(rows).tolist():
-            factor = getattr(self.windows[k].sensors[sensor], part)
-            if factor is not None:
-                yield k, self._with_residual(sensor, factor)
+    def _sums(self):
+        return Recent(MOST_SUMS)
 
     @cached_property
     def sessions(self) -> list[np.ndarray]:
@@ -117,7 +143,7 @@ class ReducedRecording:
         return {sensor: coefficients(self.model, sensor, self.values) for sensor in SENSORS}
 
     def _with_residual(self, sensor, rows):
-        own, rows = self._coefficients[sensor], rows.copy()
+        own = self._coefficients[sensor]
         rows[..., -3:] -= rows[..., :len(own)] @ own
         return rows
 
@@ -129,17 +155,25 @@ class ReducedRecording:
         return moved
 
     def select(self, rows: np.ndarray) -> 'ReducedRecording':
-        """Return the recording of the windows `rows` (mask) only."""
-        return replace(self, windows=tuple(window for window, kept in zip(self.windows, rows) if kept),
+        """Return the recording of the windows `rows` (mask) alone."""
+        chosen = np.flatnonzero(rows)
+        return replace(self, windows=tuple(self.windows[k] for k in chosen),
+                       factors={key: [factors[k] for k in chosen] for key, factors in self.factors.items()},
                        describe={name: values[rows] for name, values in self.describe.items()})
 
     def accumulated(self, model: SensorModel) -> Accumulator:
         """Return the Accumulator of a model; its columns are a subset of this recording's."""
         chosen = selected_columns(self.model, model)
         accumulator = Accumulator()
-        for window in self.windows:
-            accumulator.add(restricted_window(window, chosen))
+        for k in range(len(self.windows)):
+            accumulator.add(restricted_window(self._with_factors(k), chosen))
         return accumulator
+
+    def _with_factors(self, k):
+        """Return a window with its triangular factors."""
+        sensors = {sensor: replace(known, **{part: self.factors[sensor, part][k].unpacked() for part in PARTS})
+                   for sensor, known in self.windows[k].sensors.items()}
+        return replace(self.windows[k], sensors=sensors)
 
 
 def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray, bank: dict[str, list[BankEntry]],
@@ -168,12 +202,18 @@ def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel
                                *(entry.columns(ref) for entry in bank[sensor])], axis=1)
 
     reduced = []
-    for part in chunks(windows):
-        reduced += reduce_windows(part, model, table, column_function=with_bank)
+    factors: dict[tuple[str, str], list[PackedFactor]] = {(sensor, part): [] for sensor in SENSORS for part in PARTS}
+    for some in chunks(windows):
+        for window in reduce_windows(some, model, table, column_function=with_bank):
+            for (sensor, part), kept in factors.items():
+                factor = getattr(window.sensors[sensor], part)
+                kept.append(PackedFactor.of(window.sensors[sensor].within[:0] if factor is None else factor))
+            reduced.append(replace(window, sensors={sensor: replace(known, within=known.within[:0].copy(), slow=None)
+                                                    for sensor, known in window.sensors.items()}))
         if progress:
             progress(len(reduced) / len(windows))
     descriptions = [_describe(window) for window in windows]
-    return ReducedRecording(model, values, bank, tuple(reduced),
+    return ReducedRecording(model, values, bank, tuple(reduced), factors,
                             {name: np.array([d[name] for d in descriptions]) for name in descriptions[0]})
 
 

@@ -386,7 +386,8 @@ def test_what_a_drift_does_within_windows_is_predicted_and_tells_nothing_of_it()
     for slope, left in ((3.0, 0.0), (-7.0, 100.0)):
         count, each = 12, np.array([[100.0, 100.0 * slope], [100.0 * slope, 100.0 * (slope**2 + 1.0)]])
         recording = SimpleNamespace(kind=np.array(['spin'] * count), count=np.full(count, 101.0), duration=np.ones(count), keys=(), time=np.arange(float(count)), moving=np.ones(count, bool),
-                                    sessions=[np.arange(count)], mean=lambda sensor: np.tile([1.0, 3.0], (12, 1)), products_of=lambda sensor, part: np.tile(each, (count, 1, 1)))
+                                    sessions=[np.arange(count)], mean=lambda sensor: np.tile([1.0, 3.0], (12, 1)), product_sum=lambda sensor, part, rows: rows.sum() * each,
+                                    factors_of=lambda sensor, part, rows: [(np.flatnonzero(rows), np.tile(np.linalg.cholesky(each).T, (rows.sum(), 1, 1)))])
         index, join, within = ({sensor: [some] * 3 for sensor in SENSORS} for some in (np.array([0]), np.eye(2), np.diag([0.0, 1.0])))
         space = ParameterSpace(recording, ('drift',), np.full(1, 1e3), np.zeros(1), index, join, within)
         evidence = WindowEvidence(space, dict.fromkeys(SENSORS, NoiseModel(np.ones(3), np.ones(3))), np.arange(count) % 6)
