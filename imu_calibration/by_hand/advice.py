@@ -17,7 +17,7 @@ from imu_calibration.by_hand.hand_step import TURNED, HandStep, steps_from, turn
 from imu_calibration.by_hand.model import GYRO_BIAS, GYRO_MATRIX, HandModel, unpack
 from imu_calibration.by_hand.options import ByHandSettings
 from imu_calibration.calibration.coverage import DIRECTIONS, excess, share_gained
-from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.calibration.status import LACKING
 from imu_calibration.effects.base import SENSORS
 
 if TYPE_CHECKING:
@@ -137,8 +137,8 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     Recommended is the next step of the common plan, shown in the picture, if it serves the sensor; otherwise the best step for the sensor.
     """
     knowledge, lacking = knowledge_after(hand), {}
-    for name, status, sd, tolerance in zip(hand.param_names, hand.statuses, hand.sd, hand.tolerances, strict=True):
-        if status != DETERMINED:
+    for name, status, sd, tolerance in zip(hand.param_names, hand.statuses, hand.own_sd, hand.tolerances, strict=True):
+        if status in LACKING:
             lacking.setdefault(name.split('.')[0], {})[name] = float(sd / tolerance)
     parts = {sensor: [hand.model.param_names.index(name) for name in lacking[sensor]] for sensor in SENSORS if sensor in lacking}
     plan = foretold(knowledge)[:1] if parts else []
@@ -189,7 +189,7 @@ def knowledge_after(hand: HandCalibration) -> HandKnowledge:
     published = [hand.param_names.index(name) for name in model.param_names]
     expected = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
     known = expected < 0.5 * model.priors
-    wider = max(1.0, float(np.max(np.where(known, hand.sd[published] / expected, 0.0))))
+    wider = max(1.0, float(np.max(np.where(known, hand.own_sd[published] / expected, 0.0))))
     pose_sd = np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd'])
     drift_sd = np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd'])
     turn_sd = max(statistics['turn_scatter_sd'], 1e-4)

@@ -11,19 +11,19 @@ from imu_calibration.by_hand.bias_movement import bias_movements, with_movement,
 from imu_calibration.by_hand.equations import COMPONENTS, Poses, State
 from imu_calibration.by_hand.full_scale import full_scale_factor
 from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
-from imu_calibration.by_hand.model import BASE_NAMES, FIXED, HandModel, unpack
+from imu_calibration.by_hand.model import BASE_NAMES, UPPER, HandModel, unpack
 from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTurn
 from imu_calibration.by_hand.outliers import possible_turns, without_outliers
 from imu_calibration.by_hand.poses import average_poses, distinct_attitudes, noise_statistics
 from imu_calibration.by_hand.solver import first_state, solve_joint
 from imu_calibration.by_hand.turns import collect_turns, known_turn_data, sample_times
 from imu_calibration.calibration.linearisation import at_time_constants
-from imu_calibration.calibration.status import DETERMINED, HELD, statuses
+from imu_calibration.calibration.status import FIXED, HELD, statuses
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.named_models import BASE, G_SENSITIVE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.estimation.covariance_terms import DRIFT, Terms, replace_weak, total, with_term
+from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, Terms, replace_weak, total, with_term
 from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.progress import report
 from imu_calibration.samples import ImuSamples
@@ -96,6 +96,11 @@ class HandCalibration:
     def sd(self) -> np.ndarray:
         """Standard deviation of each parameter, shape (n,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def own_sd(self) -> np.ndarray:
+        """Standard deviation of each parameter relative to gravity as used, without its uncertainty (`common_scale`), shape (n,)."""
+        return np.sqrt(np.diag(self.covariance - self.terms[GRAVITY]))
 
     def value(self, name: str) -> float:
         """Return the parameter called `name`."""
@@ -233,15 +238,18 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
     used, poses = poses, data.poses   # the result has all poses unchanged, also excluded and drifting ones
     goals = model.tolerances(options.tolerances)
-    status = statuses(np.sqrt(np.diag(total(terms))), found.held, goals)
+    status = statuses(np.sqrt(np.diag(total(terms) - terms[GRAVITY])), found.held, goals)
     statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
                   'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()},
                   **_statistics(model, found, poses, turns)}
+    if options.gravity_sd:
+        sd, goal = options.gravity_sd / options.gravity, float(goals[3])
+        statistics['common_scale'] = {'sd': sd, 'tolerance': goal, 'status': str(statuses([sd], [False], [goal])[0])}
     names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
-    index = np.array([model.param_names.index(name) if name not in FIXED else -1 for name in names])
+    index = np.array([model.param_names.index(name) if name not in UPPER else -1 for name in names])
     padded = {name: np.pad(term, (0, 1))[np.ix_(index, index)] for name, term in terms.items()}  # index -1: zero by convention, certain
     return HandCalibration(names, np.append(found.state.values, 0.0)[index], padded,
-                           tuple((*status, DETERMINED)[k] for k in index), np.append(goals, goals[3])[index],
+                           tuple((*status, FIXED)[k] for k in index), np.append(goals, goals[3])[index],
                            np.append(model.priors, 0.0)[index], options.gravity, dict(GAUGE), statistics, poses, found.state, model,
                            found.factor.T @ found.factor, used, turns, found.model_error)
 
@@ -249,15 +257,15 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
 def with_weak_replaced(hand: HandCalibration) -> HandCalibration:
     """Return the calibration with weak values replaced by their prior where that lowers the expected error (`replace_weak`)."""
     held = np.array([status == HELD for status in hand.statuses])
-    nominal = dict.fromkeys(FIXED, 0.0) | dict(zip(hand.model.param_names, hand.model.nominal))
+    nominal = dict.fromkeys(UPPER, 0.0) | dict(zip(hand.model.param_names, hand.model.nominal))
     applied = {name for effect in hand.model.model.effects if effect.compensation == 'exact' for name in effect.param_names()}
-    weak = np.flatnonzero(~held & (hand.sd > hand.tolerances) & np.isin(hand.param_names, list(applied)))
+    weak = np.flatnonzero(~held & (hand.own_sd > hand.tolerances) & np.isin(hand.param_names, list(applied)))
     values, terms, replaced = replace_weak(hand.values, hand.terms, np.array([nominal[name] for name in hand.param_names]),
                                            weak=weak.tolist())
     known = dict(zip(hand.param_names, values))
     state = replace(hand.state, values=np.array([known[name] for name in hand.model.param_names]))
     return replace(hand, values=values, terms=terms, state=state, replaced=tuple(np.array(hand.param_names)[replaced].tolist()),
-                   statuses=statuses(np.sqrt(np.diag(total(terms))), held | replaced, hand.tolerances))
+                   statuses=statuses(np.sqrt(np.diag(total(terms) - terms[GRAVITY])), held | replaced, hand.tolerances))
 
 
 def _settled(model, found):

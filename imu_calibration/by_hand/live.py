@@ -231,7 +231,7 @@ class LiveByHand:
 
     def status(self, hints: dict[str, str] | None = None) -> SessionStatus:
         """Return the SessionStatus: progress, and the pose or turn with the largest gain; `hints` as for `errors.with_hint`."""
-        status = hand_status(self.found, self.result.calibration if self.result else None, gravity_unknown=self.options.gravity is None,
+        status = hand_status(self.found, self.result.calibration if self.result else None,
                              step=self.coverage().next.text, hints=hints)
         return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
 

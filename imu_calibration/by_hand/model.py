@@ -14,9 +14,9 @@ from imu_calibration.reference.reference_motion import Reference
 
 LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
 """Free entries of the accelerometer matrix under the gauge."""
-FIXED = tuple(linear_names('accelerometer')[np.triu_indices(3, 1)].tolist())
+UPPER = tuple(linear_names('accelerometer')[np.triu_indices(3, 1)].tolist())
 """Zero by the choice of axes."""
-BASE_NAMES = tuple(name for name in SensorModel().param_names if name not in FIXED)
+BASE_NAMES = tuple(name for name in SensorModel().param_names if name not in UPPER)
 """Parameters of every calibration by hand, in their order."""
 N_BASE = len(BASE_NAMES)
 ACCELEROMETER, GYRO_BIAS, GYRO_MATRIX = slice(0, 9), slice(9, 12), slice(12, 21)
@@ -124,7 +124,7 @@ class HandModel:
 
     def in_model_order(self, values: np.ndarray) -> np.ndarray:
         """Return the parameters in the order of the SensorModel."""
-        known = dict(zip(self.param_names, values)) | dict.fromkeys(FIXED, 0.0)
+        known = dict(zip(self.param_names, values)) | dict.fromkeys(UPPER, 0.0)
         return np.array([known[name] for name in self.model.param_names])
 
     def further(self, sensor: str, values: np.ndarray, force: np.ndarray, *, rate: np.ndarray, time: np.ndarray | None = None,

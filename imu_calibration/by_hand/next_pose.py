@@ -10,7 +10,7 @@ from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.by_hand.result import HandResult
 from imu_calibration.by_hand.status import Findings
 from imu_calibration.calibration.coverage import DIRECTIONS, Coverage, Step
-from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.calibration.status import LACKING
 from imu_calibration.effects.named_models import BASE
 from imu_calibration.effects.sensor_model import SensorModel
 
@@ -28,7 +28,7 @@ def hand_coverage(found: Findings, result: HandResult | None, options: HandOptio
     seen = ups_of(found.poses)
     up = None if found.poses is None else seen[-1]
     knowledge = knowledge_of(found, result, options)
-    steps = [] if result is not None and set(result.hand.statuses) == {DETERMINED} else foretold(knowledge)
+    steps = [] if result is not None and not set(LACKING) & set(result.hand.statuses) else foretold(knowledge)
     if not steps:
         return Coverage(np.zeros(len(DIRECTIONS)), seen, up, Step(''), 0.0, frame_id=frame_id)
     first, worth = steps[0], knowledge.best()[1]

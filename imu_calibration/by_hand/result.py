@@ -9,7 +9,6 @@ from imu_calibration.by_hand.calibrate import HandCalibration
 from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceErrors
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.window_errors import WindowErrors
-from imu_calibration.constants import STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import Role
 from imu_calibration.segmentation.window import Window, WindowKind
 
@@ -67,12 +66,10 @@ class HandResult(CalibrationResult):
 
     def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
         """Return noise and gravity, the only reference. The sds contain the uncertainty of a gravity that was not given."""
-        model, values, sd = self.calibration.model, self.calibration.values, self.calibration.sd
-        known = self.options.gravity is not None
-        gravity_sd = (self.options.gravity_sd or errors.gravity) if known else STANDARD_GRAVITY_SD
-        part, gravity = model.part('accelerometer', Role.LINEAR), np.zeros(len(sd))
-        gravity[part] = np.abs(values[part]) * gravity_sd / self.gravity
-        noise = sd if known and not self.options.gravity_sd else np.sqrt(np.maximum(sd**2 - gravity**2, 0.0))
-        return ErrorBudget(tuple(model.param_names), {'noise': noise, 'gravity': gravity},
+        model, values, known = self.calibration.model, self.calibration.values, self.options.gravity is not None
+        relative = self.calibration.common_scale.get('sd', errors.gravity / self.gravity)
+        part, gravity, gravity_sd = model.part('accelerometer', Role.LINEAR), np.zeros(len(values)), relative * self.gravity
+        gravity[part] = np.abs(values[part]) * relative
+        return ErrorBudget(tuple(model.param_names), {'noise': self.calibration.own_sd, 'gravity': gravity},
                            {'noise': 'noise, scatter of poses and turns, as this recording shows them',
                             'gravity': f'gravity {"known" if known else "not given: the standard one is known"} to {gravity_sd:.2g} m/s²'})

@@ -12,8 +12,7 @@ from imu_calibration.by_hand.turns import collect_turns
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.effect_states import Progress
 from imu_calibration.calibration.session import SessionStatus
-from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.calibration.verdict import SCALES
+from imu_calibration.calibration.status import COMMON_SCALE, LACKING
 from imu_calibration.errors import with_hint
 from imu_calibration.samples import ImuSamples
 from imu_calibration.segmentation.static_detector import find_still
@@ -59,7 +58,7 @@ def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> Findings:
     return Findings(rests, poses, distinct_attitudes(poses.force, settings.pose_apart), len(turns), dropped, resting)
 
 
-def hand_status(found: Findings, calibration: Calibration | None, *, gravity_unknown: bool, step: str,
+def hand_status(found: Findings, calibration: Calibration | None, *, step: str,
                 hints: dict[str, str] | None = None) -> SessionStatus:
     """
     Return the SessionStatus.
@@ -69,8 +68,6 @@ def hand_status(found: Findings, calibration: Calibration | None, *, gravity_unk
     found : Findings
     calibration : Calibration or None
         The last solution.
-    gravity_unknown : bool
-        Whether the standard gravity replaces the local one.
     step : str
         Next step in the planner's text (`advice`), '' when no pose has a gain.
     hints : dict, optional
@@ -78,7 +75,7 @@ def hand_status(found: Findings, calibration: Calibration | None, *, gravity_unk
 
     """
     not_seen = unseen(found)
-    word, needs = _needs(found, not_seen, calibration, gravity_unknown=gravity_unknown, step=step, hints=hints or {})
+    word, needs = _needs(found, not_seen, calibration, step=step, hints=hints or {})
     values = {'poses': len(found.rests), 'attitudes': found.attitudes, 'turns': found.turns,
               **{f'turns left out: {reason}': count for reason, count in found.dropped.items()},
               'directions of gravity not seen': ' '.join(not_seen), 'at rest for [s]': f'{found.resting:.1f}', 'next': '; '.join(needs)}
@@ -100,14 +97,14 @@ def unseen(found: Findings) -> list[str]:
     return sorted((name for name, angle in nearest.items() if angle > SEEN), key=lambda name: -nearest[name])
 
 
-def _needs(found, not_seen, calibration, *, gravity_unknown, step, hints):
+def _needs(found, not_seen, calibration, *, step, hints):
     if found.attitudes < POSES_LEAST or calibration is None:
         more = f' (faces not seen yet: {", ".join(not_seen)})' if not_seen else ''
         return Progress.WAITING, [f'{step}{more}; {POSES_LEAST} attitudes at least, {POSES_FULL} for all parameters']
-    lacking = [name for name, status in zip(calibration.param_names, calibration.status) if status != DETERMINED]
+    lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
     if not lacking:
         return Progress.DETERMINED, []
-    if gravity_unknown and set(lacking) <= set(SCALES):
+    if lacking == [COMMON_SCALE]:
         return Progress.WEAK, [with_hint('give the local gravity, which scales the accelerometer as a whole', 'gravity', hints)]
     return Progress.WEAK, [step] if step else list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
 

@@ -22,6 +22,7 @@ from imu_calibration.calibration.verdict import judged
 from imu_calibration.effects.applied import centred
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import InputError
+from imu_calibration.estimation.covariance_terms import GRAVITY
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.preflight.evidence import CheckFinding
 from imu_calibration.preflight.joint_checks import check_force
@@ -145,7 +146,7 @@ def hand_result(evident: EvidentHand, recording: HandRecording, options: Calibra
     held, tolerances = np.array([hand.statuses[k] == HELD for k in order]), tolerances_of(model, options.tolerances)
     statistics = _statistics(hand, gathered.counts, len(recording.imu)) | preflight_statistics(findings) | evident.changes.to_mapping()
     statistics |= uncorrected.to_mapping()
-    status = statuses(np.sqrt(np.diag(covariance)), held, tolerances)
+    status = statuses(np.sqrt(sum(term for name, term in terms.items() if name != GRAVITY)), held, tolerances)
     calibration = Calibration(replace(final, centre=dict(uncorrected.centre)), values, covariance, status,
                               gathered.frame_id, dict(hand.gauge), tuple(dict(item) for item in hand.advice), statistics,
                               conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})},

@@ -8,7 +8,7 @@ import numpy as np
 
 from imu_calibration.calibration.effect_states import GroupState
 from imu_calibration.calibration.from_solution import possible_motions
-from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.calibration.status import DETERMINED, LACKING
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.observability import added_information
@@ -190,5 +190,5 @@ def _arms(result):
     if effect is None:
         return None
     part = result.model.slices[effect.key]
-    known = all(status == DETERMINED for status in result.calibration.status[part])
+    known = not set(LACKING) & set(result.calibration.status[part])
     return result.calibration.values[part].reshape(3, 3) if known else None

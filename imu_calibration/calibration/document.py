@@ -11,12 +11,13 @@ from imu_calibration.calibration import shown
 from imu_calibration.calibration.decision import SensorDecision, decide, most_cautious
 from imu_calibration.calibration.document_checks import check_numbers, check_parts
 from imu_calibration.calibration.document_parts import parts_of
-from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.calibration.status import COMMON_SCALE, FIXED, LACKING
 from imu_calibration.documents import from_text, to_text
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError, shortened
+from imu_calibration.estimation.covariance_terms import GRAVITY
 from imu_calibration.samples import ImuSamples
 
 if TYPE_CHECKING:
@@ -80,6 +81,23 @@ class Calibration:
         """Standard deviations, shape (n_params,)."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0, None))
 
+    @property
+    def common_scale(self) -> dict:
+        """{'sd', 'tolerance', 'status'} of the accelerometer's common scale by hand, {} where gravity counts as exact."""
+        return self.statistics.get('by_hand', {}).get('common_scale', {})
+
+    @property
+    def own_sd(self) -> np.ndarray:
+        """Standard deviations without `common_scale`, relative to which the other parameters are judged, shape (n_params,)."""
+        common = self.covariance_terms.get(GRAVITY, 0.0) if self.common_scale else 0.0
+        return np.sqrt(np.clip(np.diag(self.covariance) - common, 0, None))
+
+    @property
+    def status_by_name(self) -> dict[str, str]:
+        """Status of each parameter and of the common scale, by name."""
+        common = {COMMON_SCALE: self.common_scale['status']} if self.common_scale else {}
+        return dict(zip(self.param_names, self.status)) | common
+
     def value(self, sensor: str, effect: str) -> np.ndarray:
         """Return the value of one effect in its documented shape."""
         found = self.model.catalogue.find(sensor, effect, self.model.joint_names)
@@ -126,12 +144,13 @@ class Calibration:
 
     @property
     def requested(self) -> dict[str, str]:
-        """Status of the requested parameters, by name; table, clock and the common arm are nuisances."""
-        return {name: status for name, status, wanted in zip(self.param_names, self.status, self.model.requested) if wanted}
+        """Status of the requested parameters and of the common scale, by name; table, clock and the common arm are nuisances."""
+        nuisances = set(np.array(self.param_names)[~self.model.requested])
+        return {name: status for name, status in self.status_by_name.items() if name not in nuisances and status != FIXED}
 
     def all_determined(self) -> bool:
         """Return whether every parameter is determined."""
-        return all(status == DETERMINED for status in self.status)
+        return not set(LACKING) & set(self.status_by_name.values())
 
     def compensate(self, samples: ImuSamples | np.ndarray, rate_s: np.ndarray | None = None, *, time: np.ndarray | None = None,
                    temperature_c: Any = None) -> ImuSamples | tuple[np.ndarray, np.ndarray]:
@@ -221,7 +240,7 @@ def _section(calibration, section):
         part = calibration.model.slices[effect.key]
         status = np.array(calibration.status, dtype=object)[part].reshape(effect.shape)
         entries[effect.name] = {
-            'value': _plain(calibration.values[part].reshape(effect.shape)), 'sd': _plain(calibration.sd[part].reshape(effect.shape)),
+            'value': _plain(calibration.values[part].reshape(effect.shape)), 'sd': _plain(calibration.own_sd[part].reshape(effect.shape)),
             'unit': effect.unit if isinstance(effect.unit, str) else list(effect.unit), 'status': status.tolist()}
         centre = {group.name: calibration.model.centre[group.name] for group in effect.groups if group.name in calibration.model.centre}
         if centre:

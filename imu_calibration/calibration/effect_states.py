@@ -48,7 +48,7 @@ class GroupState:
 def group_states(result: CalibrationResult) -> list[GroupState]:
     """Return the GroupState of every effect of a CalibrationResult, in the order of the model."""
     calibration, states = result.calibration, []
-    names, sd = calibration.param_names, calibration.sd
+    names, sd = calibration.param_names, calibration.own_sd
     for effect in calibration.model.effects:
         part = calibration.model.slices[effect.key]
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))

@@ -5,7 +5,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from imu_calibration.calibration.decision import decisions_text
-from imu_calibration.calibration.status import Status
+from imu_calibration.calibration.status import COMMON_SCALE, Status
 from imu_calibration.units import for_people, with_sd
 
 if TYPE_CHECKING:
@@ -22,13 +22,16 @@ def parameter_rows(calibration: 'Calibration') -> Iterator[tuple[str, ...]]:
         part = calibration.model.slices[effect.key]
         for k, index in enumerate(range(part.start, part.stop)):
             factor, unit = for_people(effect.unit_of(k), effect.sensor)
-            value, sd = with_sd(calibration.values[index] * factor, calibration.sd[index] * factor)
+            value, sd = with_sd(calibration.values[index] * factor, calibration.own_sd[index] * factor)
             yield calibration.param_names[index], value, sd, unit, str(calibration.status[index])
+    if common := calibration.common_scale:
+        yield COMMON_SCALE, *with_sd(1.0, common['sd']), '1', str(common['status'])
 
 
 def summary(calibration: 'Calibration') -> str:
     """Return one line: the frame, the decisions, and how many parameters have which status."""
-    counts = {status: sum(own == status for own in calibration.status) for status in Status}
+    known = list(calibration.status_by_name.values())
+    counts = {status: known.count(status) for status in Status}
     parts = ', '.join(f'{count} {status}' for status, count in counts.items() if count)
     return f'<Calibration of {calibration.frame_id or "an IMU"}: {decisions_text(calibration.decisions)}, {parts}>'
 

@@ -17,9 +17,15 @@ class Status(StrEnum):
     """It is not, but value and standard deviation are honest."""
     HELD = 'held'
     """Not determined by the recording: value and sd are those of the prior."""
+    FIXED = 'fixed'
+    """A convention, for example the axes: exact."""
 
 
-DETERMINED, WEAK, HELD = Status
+DETERMINED, WEAK, HELD, FIXED = Status
+LACKING = (WEAK, HELD)
+"""Statuses of parameters that need more data."""
+COMMON_SCALE = 'accelerometer.common_scale'
+"""Factor on all accelerometer readings by hand from an uncertain gravity; the sds of the other parameters are judged without it."""
 WEAK_DATA, LIKELIHOOD_RATIO, REPLACEMENT = 'weak data', 'likelihood ratio', 'replacement'
 """
 Reasons for which a parameter is held: its sd would exceed half the prior's; its prior is not significantly worse; the prior has the smaller
@@ -34,14 +40,14 @@ def statuses(sd: Iterable[float], held: Iterable[bool], tolerances: Iterable[flo
     Parameters
     ----------
     sd : array_like, shape (n_params,)
-        Standard deviations, SI.
+        Standard deviations, SI; 0 for a convention.
     held : array_like of bool, shape (n_params,)
         Whether the parameter is fixed at its prior.
     tolerances : array_like, shape (n_params,)
         Largest standard deviation of a determined parameter, SI.
 
     """
-    return tuple(HELD if h else DETERMINED if s <= t else WEAK for h, s, t in zip(held, sd, tolerances, strict=True))
+    return tuple(HELD if h else FIXED if s == 0 else DETERMINED if s <= t else WEAK for h, s, t in zip(held, sd, tolerances, strict=True))
 
 
 def reasons_held(held: Iterable[bool], names: Iterable[str], replaced: Collection[str]) -> dict[str, str]:

@@ -8,7 +8,7 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.nominal import with_nominal
 from imu_calibration.calibration.plausibility import beyond_instruments
 from imu_calibration.calibration.reasons import HAND_AXES, listed
-from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.calibration.status import LACKING
 from imu_calibration.calibration.uncorrected import uncorrected_lines
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.errors import DocumentError
@@ -82,7 +82,7 @@ def _mostly_undetermined(calibration, sensor):
     """Return why an unproven sensor is not applied even with consent; '' where it may be."""
     status = [calibration.status[place] for effect in calibration.model.effects if effect.sensor == sensor
               for place in range(*calibration.model.slices[effect.key].indices(len(calibration.status)))]
-    missing = sum(each != DETERMINED for each in status)
+    missing = sum(each in LACKING for each in status)
     return f'unproven, and {missing} of {len(status)} parameters are not determined' \
         if calibration.decisions[sensor] is UNPROVEN and 2 * missing > len(status) else ''
 
@@ -108,8 +108,9 @@ def caveats(calibration: Calibration) -> list[str]:
 
 def missing(calibration: Calibration) -> str:
     """Return which parameters are not determined, as text; '' when all are."""
-    names = [name for name, status in zip(calibration.param_names, calibration.status) if status != DETERMINED]
-    return f'{len(names)} of {len(calibration.status)} parameters not determined ({listed(names)})' if names else ''
+    known = calibration.status_by_name
+    names = [name for name, status in known.items() if status in LACKING]
+    return f'{len(names)} of {len(known)} parameters not determined ({listed(names)})' if names else ''
 
 
 def standing(calibration: Calibration) -> str:

@@ -19,7 +19,6 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.plausibility import beyond_known, implausible
 from imu_calibration.calibration.reasons import (
     DECISION,
-    HAND_AXES,
     MISFIT,
     NOTE,
     PARAMETERS,
@@ -30,13 +29,9 @@ from imu_calibration.calibration.reasons import (
     quiet,
     rested,
 )
-from imu_calibration.calibration.status import DETERMINED, HELD, Status
+from imu_calibration.calibration.status import COMMON_SCALE, DETERMINED, HELD, Status
 from imu_calibration.calibration.verdict_notes import notes_on
-from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
-from imu_calibration.effects.sensor_model import linear_names
-
-SCALES = tuple(linear_names('accelerometer').diagonal().tolist())
 
 
 @dataclass(frozen=True)
@@ -100,9 +95,11 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     """
     decisions = {sensor: _decision(calibration, sensor) for sensor in SENSORS}
     found = list(calibration.requested.values())
-    share = np.where(calibration.model.requested, calibration.sd / tolerances, 0.0)
+    share = np.where(calibration.model.requested, calibration.own_sd / tolerances, 0.0)
     worst = int(np.argmax(share))
     limiting = (calibration.param_names[worst], float(share[worst])) if found else ('', 0.0)
+    if common := calibration.common_scale:
+        limiting = max(limiting, (COMMON_SCALE, common['sd'] / common['tolerance']), key=lambda pair: pair[1])
     within = found.count(DETERMINED)
     reasons = [_decided(calibration, sensor, word) for sensor, word in decisions.items()]
     reasons.append(_parameters(calibration, within, limiting, complete=within == len(found) and set(decisions.values()) == {HELPS}))
@@ -205,19 +202,14 @@ def _undetermined(calibration):
     for status, text in ((Status.WEAK, 'sd above the tolerance'),
                          (HELD, 'held at the prior value')):
         names = [name for name, found in calibration.requested.items() if found == status]
-        if status == Status.WEAK and _gravity_unknown(calibration, names):
-            scale, names = [n for n in names if n in SCALES], [n for n in names if n not in SCALES]
-            what = f'{listed(scale)}: the local gravity was not given, which scales them together'
+        if COMMON_SCALE in names:
+            names.remove(COMMON_SCALE)
+            what = f'{COMMON_SCALE}: sd {100 * calibration.common_scale["sd"]:.2g} %, that of gravity; it is not part of the other sds'
             reasons.append(Reason(PARAMETERS, what, 'give the local gravity', key='gravity', sensors=SENSORS[:1]))
         for next_step, members in _by_need(calibration, names).items():
             reasons.append(Reason(PARAMETERS, f'{listed(members)}: {text}', next_step,
                                   sensors=_whose(name.partition('.')[0] for name in members)))
     return reasons
-
-
-def _gravity_unknown(calibration, names):
-    by_hand = calibration.gauge.get('axes') == HAND_AXES
-    return by_hand and calibration.conditions.get('gravity') == STANDARD_GRAVITY and bool(set(SCALES) & set(names))
 
 
 def _by_need(calibration, names):

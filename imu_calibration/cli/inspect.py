@@ -134,7 +134,7 @@ def _show_by_hand(out, found, hints):
 def _show_parameters(out, calibration):
     """Print the parameters by status, and the motions that would determine more."""
     groups = {}
-    for name, status in zip(calibration.param_names, calibration.status):
+    for name, status in calibration.status_by_name.items():
         groups.setdefault(status, []).append(name)
     for status, names in groups.items():
         out.print(f'{status}: {", ".join(names)}', soft_wrap=True)

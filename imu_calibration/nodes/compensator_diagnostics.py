@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration import trust
-from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.calibration.status import LACKING
 from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, MOVED, UNIT, WAITING
 from imu_calibration.constants import HOTTEST_C
@@ -171,7 +171,7 @@ class CompensatorDiagnostics:
         calibration, compensation = adopted.calibration, adopted.compensation
         values |= {'decision': trust.standing(calibration), 'not corrected': ', '.join(adopted.used.refused) or 'none',
                    'date': calibration.conditions.get('date', ''),
-                   'parameters': len(calibration.status), 'not determined': sum(status != DETERMINED for status in calibration.status),
+                   'parameters': len(calibration.status), 'not determined': sum(status in LACKING for status in calibration.status),
                    'messages': compensation.received, 'corrected': compensation.corrected, **compensation.counts}
         line, derivative = compensation.slope.line, compensation.slope.derivative
         if line is not None:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.status import DETERMINED, HELD, REPLACEMENT
+from imu_calibration.calibration.status import COMMON_SCALE, DETERMINED, FIXED, HELD, REPLACEMENT
 from imu_calibration.diagnosis.workflow import DiagnosisResult
 from imu_calibration.report.numbers import in_unit, pair, people, text
 
@@ -23,22 +23,28 @@ def parameter_groups(result: CalibrationResult | DiagnosisResult) -> list[dict[s
     groups = []
     for effect in calibration.model.effects:
         part = calibration.model.slices[effect.key]
-        rows = [_row(result, index, effect.unit_of(k), effect.components[k], needs) for k, index in enumerate(range(part.start, part.stop))]
+        rows = [_row(calibration.param_names[index], effect.components[k], calibration.values[index], sd=calibration.own_sd[index],
+                     tolerance=result.tolerances[index], unit=effect.unit_of(k), status=calibration.status[index],
+                     why=_why(calibration, index, calibration.own_sd[index] / result.tolerances[index], needs))
+                for k, index in enumerate(range(part.start, part.stop))]
         groups.append({'sensor': SENSOR_TITLES[effect.section], 'title': effect.heading, 'name': effect.name,
                        'explanation': effect.explanation, 'use': USE[effect.compensation], 'rows': rows, 'unit': effect.unit_of(0)})
+    if common := calibration.common_scale:
+        groups.append({'sensor': SENSOR_TITLES['accelerometer'], 'title': 'Common scale', 'name': COMMON_SCALE, 'use': 'its value is 1, not removed',
+                       'explanation': 'An error of the gravity used as reference scales all readings; the sds of the other parameters are '
+                                      'given without it', 'unit': '1',
+                       'rows': [_row(COMMON_SCALE, 'scale', 1.0, sd=common['sd'], tolerance=common['tolerance'], unit='1',
+                                     status=common['status'], why='the local gravity was not given exactly')]})
     return groups
 
 
-def _row(result, index, unit, component, needs):
-    calibration = result.calibration
-    value, sd, tolerance = calibration.values[index], calibration.sd[index], result.tolerances[index]
-    name = calibration.param_names[index]
+def _row(name, component, value, *, sd, tolerance, unit, status, why):
     shown = people(value, sd, unit, quantity=name)
     share = sd / tolerance
     return {'name': name, 'component': component, 'value': shown[0], 'sd': shown[1], 'unit': shown[2],
             'si': '' if unit == '1' else ' ± '.join(pair(value, sd)) + f' {printed(unit)}',
             'tolerance': in_unit(tolerance, unit, 2, quantity=name), 'share': text(share, 2),
-            'bar': _bar(share), 'status': calibration.status[index], 'why': _why(calibration, index, share, needs)}
+            'bar': _bar(share), 'status': status, 'why': why}
 
 
 def printed(unit: str) -> str:
@@ -53,7 +59,7 @@ def _bar(share):
 
 def _why(calibration, index, share, needs):
     status, name = calibration.status[index], calibration.param_names[index]
-    if calibration.sd[index] == 0:
+    if status == FIXED:
         return 'fixed by the choice of axes'
     if status == DETERMINED:
         return ''

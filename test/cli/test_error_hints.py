@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.by_hand.status import Findings, hand_status
+from imu_calibration.calibration.status import COMMON_SCALE
 from imu_calibration.cli.hints import hints_of
 from imu_calibration.cli.main import main
 from imu_calibration.cli.parser import VERBS, make_parser
@@ -149,7 +150,7 @@ def test_the_command_line_says_its_option(capsys, tmp_path):
 
 def test_the_live_session_by_hand_says_the_parameter_of_its_node():
     class Solved:
-        param_names, status, undetermined = ('accelerometer.matrix.xx',), ('weak',), ()
+        status_by_name, undetermined = {COMMON_SCALE: 'weak'}, ()
     found = Findings([slice(0, 9)] * 9, None, 9, 8, {}, 0.0)
-    assert hand_status(found, Solved, gravity_unknown=True, step='', hints=HINTS['calibration_node']).message.endswith(
+    assert hand_status(found, Solved, step='', hints=HINTS['calibration_node']).message.endswith(
         "next: give the local gravity, which scales the accelerometer as a whole (parameter 'gravity')")

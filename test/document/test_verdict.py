@@ -8,9 +8,9 @@ import pytest
 from imu_calibration.calibration.decision import HELPS, UNPROVEN
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.reasons import DECISION, NOTE, PARAMETERS, WARNING
+from imu_calibration.calibration.shown import parameter_rows
 from imu_calibration.calibration.status import DETERMINED, HELD, WEAK, tolerances_of
 from imu_calibration.calibration.verdict import judge, judged
-from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.sensor_model import SensorModel
 
 MODEL = SensorModel(reference=('table_tilt',))
@@ -115,12 +115,18 @@ def test_decisions_come_first_then_parameters_and_warnings():
     assert any(line.startswith('warning: ') for line in found.lines())
 
 
-def test_a_gravity_that_was_not_given_is_asked_for_once_and_by_hand_only():
-    scales = [f'accelerometer.matrix.{axis}{axis}' for axis in 'xyz']
-    gauge, conditions = {'axes': 'accelerometer_lower_triangular'}, {'gravity': STANDARD_GRAVITY}
-    found = judge(with_status(WEAK, *scales, gauge=gauge, conditions=conditions), TOLERANCES)
-    assert [reason.key for reason in found.reasons if reason.key] == ['gravity']
-    assert not any(reason.key for reason in judge(with_status(WEAK, *scales, conditions=conditions), TOLERANCES).reasons)
+def test_an_uncertain_gravity_by_hand_is_one_parameter_in_addition_to_the_others():
+    common = {'sd': 2e-3, 'tolerance': 1e-3, 'status': 'weak'}
+    known, base = calibration(), with_statistics(by_hand={'common_scale': common})
+    share = np.where([name.startswith('accelerometer.matrix') for name in NAMES], 2e-3**2, 0.0)
+    base = replace(base, covariance=base.covariance + np.diag(share), covariance_terms={'gravity': share})
+    assert np.allclose(base.own_sd, known.sd, rtol=1e-12)
+    found, without = judge(base, TOLERANCES), judge(known, TOLERANCES)
+    assert [reason.key for reason in found.reasons if reason.key] == ['gravity'] and not any(reason.key for reason in without.reasons)
+    assert (found.within, found.requested) == (without.within, without.requested + 1) and not found.complete
+    assert found.limiting == ('accelerometer.common_scale', 2.0)
+    assert [row[0] for row in parameter_rows(base)] == [*NAMES, 'accelerometer.common_scale']
+    assert [row[:4] for row in parameter_rows(base)][:-1] == [row[:4] for row in parameter_rows(known)]
 
 
 def test_a_bias_that_moves_more_than_its_tolerance_is_a_note():

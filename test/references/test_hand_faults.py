@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.by_hand.bias_movement import notes
-from imu_calibration.by_hand.calibrate import calibrate_by_hand
+from imu_calibration.by_hand.calibrate import calibrate_by_hand, with_weak_replaced
 from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
-from imu_calibration.by_hand.model import unpack
+from imu_calibration.by_hand.model import UPPER, unpack
 from imu_calibration.by_hand.options import HandOptions, hand_options
 from imu_calibration.by_hand.poses import average_poses
 from imu_calibration.by_hand.turns import at_range_end, rising, sample_times
@@ -280,3 +280,13 @@ def test_the_error_budget_lists_an_unknown_gravity_under_gravity_and_the_given_s
     assert budgets[0].causes['gravity'][scale] == pytest.approx(STANDARD_GRAVITY_SD / STANDARD_GRAVITY, rel=0.05)
     assert budgets[0].causes['noise'][scale] == pytest.approx(budgets[1].causes['noise'][scale], rel=0.05)
     assert budgets[1].causes['gravity'][scale] < 0.1 * budgets[0].causes['gravity'][scale]
+    assert unknown.calibration.common_scale['status'] == 'weak' and given.calibration.common_scale == {}
+    assert unknown.calibration.status == given.calibration.status and unknown.calibration.status[scale] == 'determined'
+    assert [name for name, status in unknown.calibration.status_by_name.items() if status == 'fixed'] == list(UPPER)
+
+
+def test_an_unknown_gravity_does_not_change_the_recommended_poses():
+    imu, ranges, _ = hold_and_turn(3, n_poses=6)
+    unknown, given = (calibrate_by_hand(imu, HandOptions(STANDARD_GRAVITY, sd), ranges) for sd in (STANDARD_GRAVITY_SD, 0.0))
+    assert unknown.advice == given.advice != ()
+    assert with_weak_replaced(unknown).replaced == with_weak_replaced(given).replaced
