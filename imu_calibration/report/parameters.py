@@ -13,6 +13,7 @@ SENSOR_TITLES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope', 're
 USE = {'exact': 'removed by compensation', 'flagged': 'cannot be removed, samples are marked',
        'none': 'belongs to the table or the session, not removed'}
 
+COMMON = 'An error of the gravity used as reference scales all readings. The sds of the other parameters are given without it.'
 UNSEEN = 'fixed at its prior: its sd would exceed half of the prior sd'
 REPLACED = 'fixed at its prior: the estimate is weak and within one sd of it, so that the prior has the smaller expected error'
 
@@ -30,9 +31,8 @@ def parameter_groups(result: CalibrationResult | DiagnosisResult) -> list[dict[s
         groups.append({'sensor': SENSOR_TITLES[effect.section], 'title': effect.heading, 'name': effect.name,
                        'explanation': effect.explanation, 'use': USE[effect.compensation], 'rows': rows, 'unit': effect.unit_of(0)})
     if common := calibration.common_scale:
-        groups.append({'sensor': SENSOR_TITLES['accelerometer'], 'title': 'Common scale', 'name': COMMON_SCALE, 'use': 'its value is 1, not removed',
-                       'explanation': 'An error of the gravity used as reference scales all readings; the sds of the other parameters are '
-                                      'given without it', 'unit': '1',
+        groups.append({'sensor': SENSOR_TITLES['accelerometer'], 'title': 'Common scale', 'name': COMMON_SCALE, 'unit': '1',
+                       'use': 'its value is 1, not removed', 'explanation': COMMON,
                        'rows': [_row(COMMON_SCALE, 'scale', 1.0, sd=common['sd'], tolerance=common['tolerance'], unit='1',
                                      status=common['status'], why='the local gravity was not given exactly')]})
     return groups
