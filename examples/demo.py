@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 
 from imu_calibration import files
+from imu_calibration.calibration.status import LACKING
 from imu_calibration.cli.main import main
 from imu_calibration.cli.show import console
 from imu_calibration.compensation import evaluation
@@ -35,7 +36,7 @@ def run(folder):
     table, calibration = files.read_table(second / 'table.yaml'), files.read_calibration(folder / 'calibration.yaml')
     truth = evaluation.session_truth(source_of(second, joint_names=table.joint_names)(), table)
     show(evaluation.before_and_after(truth, calibration))
-    lacking = [name for name, status in zip(calibration.param_names, calibration.status) if status != 'determined']
+    lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
     print('not determined by this recording: ' + (', '.join(lacking) if lacking else 'nothing; every parameter is within its tolerance'))
     print(f'report: {(folder / "report.html").resolve()}')
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
 from imu_calibration.by_hand.options import HandOptions, KnownTurn
+from imu_calibration.calibration.status import LACKING
 from validation.recordings import load, reference
 from validation.second_opinions import FACES, TURNS, accelerometer_of, ferraris, installed
 from validation.section import Section, text
@@ -110,7 +111,7 @@ def run(folder, plots):
                   'bias within 1 mm/s², matrix within 0.0001', f'{1e3 * left[0]:.3f} mm/s², {left[1]:.6f}',
                   left[0] < 1e-3 and left[1] < 1e-4)
     sensitivity = any('g_sensitivity' in name for name in found.param_names)
-    weak = [name for name, status in zip(found.param_names, found.statuses) if status != 'determined']
+    weak = [name for name, status in zip(found.param_names, found.statuses) if status in LACKING]
     section.say(text('ferraris', gravity=GRAVITY, turn_deg=known['turn_deg'], tilts=', '.join(f'{t:.1f}' for t in tilts(up)),
                      sensitivity='estimates it' if sensitivity else 'leaves it out, since six attitudes do not show it',
                      weak=', '.join(weak) or 'nothing'))

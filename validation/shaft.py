@@ -2,6 +2,7 @@
 
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.status import LACKING
 from imu_calibration.documents import from_text
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.reference.table import Table
@@ -47,7 +48,7 @@ def not_determined(calibration):
     """Return {status: names} of what is weak or held."""
     groups = {}
     for name, status in zip(calibration.param_names, calibration.status):
-        if status != 'determined':
+        if status in LACKING:
             groups.setdefault(status, []).append(name)
     return groups
 
