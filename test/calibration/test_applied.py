@@ -22,6 +22,8 @@ from msg_adapters.write import write_session
 
 from worlds.hand_sessions import GRAVITY, simulate
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 FORMULA = CATALOGUE.with_effects(term('warm_force', sensor='gyroscope', column='f_x * (temperature_c - temperature_ref_c)', unit='(rad/s)/(m/s^2)/K',
                                       tolerance=1e-6, text='A formula.', largest=1e-4))
 SESSIONS = {'bias and matrix': {}, 'findings': {'effects': ['accel_quadratic', 'gyro_g_sensitivity', 'gyro_bias_drift']},

@@ -17,6 +17,8 @@ from imu_calibration.use_cases.check import check
 from worlds.misfit_worlds import make_pair
 from worlds.physics import write_bag
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 
 @pytest.fixture(scope='module')
 def pair():

@@ -29,6 +29,8 @@ from imu_calibration.nodes.diagnosis_thread import DiagnosisThread  # noqa: E402
 
 from ros.threads import until  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 
 class Station:
     """A LiveCalibration fed as calibration_node feeds it."""

@@ -13,6 +13,8 @@ from imu_calibration.use_cases.check import check
 
 from worlds.misfit_worlds import SHAFT, make_pair
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 VERTICAL = {**SHAFT, 'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1]}
 
 

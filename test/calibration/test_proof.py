@@ -17,6 +17,8 @@ from imu_calibration.use_cases.calibrate import calibrate
 
 from worlds.misfit_worlds import make_pair
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 SENSORS = ('accelerometer', 'gyroscope')
 
 
