@@ -24,8 +24,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))
 from imu_calibration.calibration.options import CalibrationOptions, choose_model  # noqa: E402
 from imu_calibration.calibration.status import tolerances_of  # noqa: E402
 from imu_calibration.effects.base import SENSORS  # noqa: E402
-from imu_calibration.effects.named_models import NAMED_MODELS  # noqa: E402
-from imu_calibration.effects.sensor_model import SensorModel  # noqa: E402
+from imu_calibration.effects.sensor_model import (
+    NAMED_MODELS,  # noqa: E402
+    SensorModel,  # noqa: E402
+)
 from imu_calibration.planning.belief import exact_information  # noqa: E402
 from imu_calibration.planning.coordinates import Coordinates  # noqa: E402
 from imu_calibration.planning.planner import Planner, make_planner  # noqa: E402

@@ -203,7 +203,7 @@ def picture(path, watcher, calibration, errors):
     matplotlib.use('Agg')
     import matplotlib.pyplot as plt
 
-    from imu_calibration.calibration.document import calibration_from_text
+    from imu_calibration.calibration.document_parts import calibration_from_text
     from imu_calibration.calibration.status import tolerances_of
     start = next(at for at, text, _ in watcher.drive if not text.startswith('idle'))
     figure, (known, left) = plt.subplots(2, 1, figsize=(9, 7), constrained_layout=True)

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imu_calibration.by_hand.calibrate import HandCalibration
 from imu_calibration.by_hand.equations import Poses
 from imu_calibration.by_hand.hand_step import TURNED, HandStep, steps_from, turn_rows
 from imu_calibration.by_hand.model import GYRO_BIAS, GYRO_MATRIX, HandModel, unpack
@@ -19,9 +19,6 @@ from imu_calibration.by_hand.options import ByHandSettings
 from imu_calibration.calibration.coverage import DIRECTIONS, excess, share_gained
 from imu_calibration.calibration.status import LACKING
 from imu_calibration.effects.base import SENSORS
-
-if TYPE_CHECKING:
-    from imu_calibration.by_hand.calibrate import HandCalibration
 
 TREMBLING, CREEPING = 1.5e-3, 5e-4
 """m/s^2, rad/s (0.03 deg/s); expected sd of the means of a pose from noise, trembling and creeping hands, before it is estimated."""

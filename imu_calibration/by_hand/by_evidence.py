@@ -11,7 +11,7 @@ from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.calibration.model_changes import ModelChanges
 from imu_calibration.calibration.plausibility import one_significant
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.named_models import BASE
+from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.estimation.covariance_terms import REJECTED, with_term
 
 

@@ -6,7 +6,6 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from imu_calibration.by_hand.advice import missing_motion
 from imu_calibration.by_hand.bias_movement import bias_movements, with_movement, without_movement
 from imu_calibration.by_hand.equations import COMPONENTS, Poses, State
 from imu_calibration.by_hand.full_scale import full_scale_factor
@@ -20,8 +19,7 @@ from imu_calibration.by_hand.turns import collect_turns, known_turn_data, sample
 from imu_calibration.calibration.linearisation import at_time_constants
 from imu_calibration.calibration.status import FIXED, HELD, statuses
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.named_models import BASE, G_SENSITIVE
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, Terms, replace_weak, total, with_term
 from imu_calibration.estimation.model_error import ModelError
@@ -86,11 +84,6 @@ class HandCalibration:
     def covariance(self) -> np.ndarray:
         """Covariance of `values`, the sum of its terms, shape (n, n)."""
         return total(self.terms)
-
-    @cached_property
-    def advice(self) -> tuple[dict, ...]:
-        """({'parameters': {name: sd over tolerance}, 'needs': the next step}, ...) for undetermined parameters."""
-        return missing_motion(self)
 
     @property
     def sd(self) -> np.ndarray:

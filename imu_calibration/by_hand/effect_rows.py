@@ -11,7 +11,7 @@ from imu_calibration.by_hand.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.by_hand.model import HandModel
 from imu_calibration.by_hand.preintegration import integrate_turn
 from imu_calibration.effects.base import SENSORS, Effect
-from imu_calibration.effects.named_models import BASE
+from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.reference.reference_motion import skew
 from imu_calibration.selection.bias_process_search import NATURAL
 

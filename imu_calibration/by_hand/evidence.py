@@ -1,7 +1,7 @@
 """Evidence from a recording without a table: few poses, so that variances are estimated too and every pose is held out in turn."""
 
+from collections.abc import Sequence
 from functools import cached_property
-from typing import Sequence
 
 import numpy as np
 

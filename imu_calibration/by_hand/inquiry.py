@@ -12,7 +12,7 @@ from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.by_hand.model import possible_by_hand
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.named_models import BASE
+from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.errors import NotObservableError
 from imu_calibration.selection.explained_share import SIGNIFICANT_REST, pruned
 from imu_calibration.selection.gain import Gain, reduction_interval

@@ -22,8 +22,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.pacing import SolvePacer
 from imu_calibration.calibration.session import SessionStatus
 from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.effects.named_models import BASE
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.samples import ImuSamples, SampleBlock
 from imu_calibration.segmentation.stamping import StampLine

@@ -11,8 +11,7 @@ from imu_calibration.by_hand.result import HandResult
 from imu_calibration.by_hand.status import Findings
 from imu_calibration.calibration.coverage import DIRECTIONS, Coverage, Step
 from imu_calibration.calibration.status import LACKING
-from imu_calibration.effects.named_models import BASE
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import BASE, SensorModel
 
 
 def knowledge_of(found: Findings, result: HandResult | None, options: HandOptions) -> HandKnowledge:

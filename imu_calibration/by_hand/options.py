@@ -6,7 +6,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.effects.named_models import parse_effects
+from imu_calibration.effects.sensor_model import parse_effects
 from imu_calibration.errors import InputError
 from imu_calibration.settings import setting
 

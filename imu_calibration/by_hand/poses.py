@@ -1,6 +1,6 @@
 """Poses from samples: means over the intervals held still, and their standard errors."""
 
-from typing import Sequence
+from collections.abc import Sequence
 
 import numpy as np
 

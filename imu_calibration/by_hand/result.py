@@ -6,9 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import HandCalibration
-from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceErrors
-from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.window_errors import WindowErrors
+from imu_calibration.calibration.result import CalibrationResult, ErrorBudget, ReferenceErrors, WindowErrors
 from imu_calibration.effects.base import Role
 from imu_calibration.segmentation.window import Window, WindowKind
 

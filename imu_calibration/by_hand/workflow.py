@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import imu_calibration
+from imu_calibration.by_hand.advice import missing_motion
 from imu_calibration.by_hand.bias_movement import notes
 from imu_calibration.by_hand.by_evidence import EvidentHand, solve_by_evidence
 from imu_calibration.by_hand.calibrate import gather_by_hand, with_weak_replaced
@@ -147,12 +148,13 @@ def hand_result(evident: EvidentHand, recording: HandRecording, options: Calibra
     statistics = _statistics(hand, gathered.counts, len(recording.imu)) | preflight_statistics(findings) | evident.changes.to_mapping()
     statistics |= uncorrected.to_mapping()
     status = statuses(np.sqrt(sum(term for name, term in terms.items() if name != GRAVITY)), held, tolerances)
+    advice = missing_motion(hand)
     calibration = Calibration(replace(final, centre=dict(uncorrected.centre)), values, covariance, status,
-                              gathered.frame_id, dict(hand.gauge), tuple(dict(item) for item in hand.advice), statistics,
+                              gathered.frame_id, dict(hand.gauge), advice, statistics,
                               conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})},
                               proof=prove_by_hand(hand, hand.used_turns if turns else (), hand_options(options).settings),
                               covariance_terms=terms, held_reason=reasons_held(held, model.param_names, hand.replaced))
-    needed = {name: (item['needs'], float('nan')) for item in reversed(hand.advice) for name in item['parameters']}
+    needed = {name: (item['needs'], float('nan')) for item in reversed(advice) for name in item['parameters']}
     return HandResult(calibration=judged(calibration, tolerances), gathered=gathered, tolerances=tolerances, needed=needed,
                       options=options, hand=hand)
 

@@ -23,8 +23,7 @@ from imu_calibration.calibration.plausibility import one_significant
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.chances import chi2_sf
 from imu_calibration.effects.base import Role
-from imu_calibration.effects.named_models import BARE
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import BARE, SensorModel
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.shrinkage import SURE
 from imu_calibration.estimation.solution import Solution

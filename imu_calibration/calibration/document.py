@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from html import escape
+from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration import shown
-from imu_calibration.calibration.decision import SensorDecision, decide, most_cautious
-from imu_calibration.calibration.document_checks import check_numbers, check_parts
-from imu_calibration.calibration.document_parts import parts_of
-from imu_calibration.calibration.status import COMMON_SCALE, FIXED, LACKING
-from imu_calibration.documents import from_text, to_text
-from imu_calibration.effects.base import SECTIONS, SENSORS, Role
-from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
+from imu_calibration.calibration.decision import SensorDecision, decide, decisions_text, most_cautious
+from imu_calibration.calibration.statements import Verdict
+from imu_calibration.calibration.status import COMMON_SCALE, FIXED, LACKING, Status
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import DocumentError, InputError, shortened
 from imu_calibration.estimation.covariance_terms import GRAVITY
 from imu_calibration.samples import ImuSamples
+from imu_calibration.units import for_people, with_sd
 
-if TYPE_CHECKING:
-    from imu_calibration.calibration.verdict import Verdict
-
-FORMAT = 'imu_calibration/1'
 UNKNOWN = 'unknown'
 """Entry of the provenance for the uncertainty of imported values."""
-_WHERE_KNOWN = ('decision', 'decision_reasons', 'notes', 'proof')
-"""Parts of a document that are omitted while unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,146 +170,54 @@ class Calibration:
         return compensate_readings(self, samples, rate_s, time=time, temperature_c=temperature_c)
 
     def __repr__(self):
-        return shown.summary(self)
+        return summary(self)
 
     def __str__(self):
-        return shown.as_text(self)
+        return as_text(self)
 
     def _repr_html_(self):
-        return shown.as_html(self)
+        return as_html(self)
 
 
-def checked_tolerances(mapping: Any, catalogue: Catalogue = CATALOGUE) -> dict[str, dict[str, float]]:
-    """
-    Return the content of a tolerance file when it is one: {section: {effect: number above zero}}.
-
-    Raises
-    ------
-    InputError
-        When a section or an effect does not exist, or a tolerance is no number above zero.
-
-    """
-    known = {section: [name for owner, name in catalogue.effects() if owner == section] for section in SECTIONS}
-    for section, entries in mapping.items():
-        if section not in known or not isinstance(entries, dict):
-            raise InputError(f'a tolerance file must have the mappings {", ".join(SECTIONS)}, it has {shortened(repr(section))}: '
-                             f'{shortened(repr(entries))}; correct it', code='tolerance_section')
-        for name, value in entries.items():
-            if name not in known[section]:
-                raise InputError(f'a tolerance must be of an effect of the {section}, {shortened(repr(name))} is not one; '
-                                 f'its effects are {", ".join(known[section])}', code='tolerance_name')
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < np.inf:
-                raise InputError(f"the tolerance of '{name}' must be a number above zero, got {shortened(repr(value))}; correct it")
-    return mapping
+HEADINGS = ('parameter', 'value', 'sd', 'unit', 'status')
+NUMBERS = ('value', 'sd')
+"""Columns that are set flush right."""
 
 
-def to_mapping(calibration: Calibration) -> dict:
-    """Return the document as plain dicts, lists, floats and strings, in a fixed order."""
-    document: dict[str, Any] = {'format': FORMAT, 'frame_id': calibration.frame_id, 'gauge': dict(calibration.gauge)}
-    if calibration.model.definitions:
-        document['effects'] = _plain(calibration.model.definitions)
-    for section in SECTIONS:
-        document[section] = _section(calibration, section)
-    document['reference_temperature_c'] = float(calibration.model.temperature_ref_c)
-    document['joint_names'] = list(calibration.model.joint_names)
-    if (errors := calibration.model.joint_names.errors) is not None:
-        document['joint_errors'] = errors
-    document['covariance'] = {'names': list(calibration.param_names), 'matrix': _plain(calibration.covariance)}
-    if calibration.covariance_terms:
-        document['covariance_terms'] = _plain(calibration.covariance_terms)
-    document['undetermined_directions'] = [dict(direction) for direction in calibration.undetermined]
-    for name in ('statistics', 'conditions', *_WHERE_KNOWN, 'provenance'):
-        part = getattr(calibration, name)
-        if part or name not in _WHERE_KNOWN:
-            document[name] = _plain(part)
-    return document
-
-
-def _section(calibration, section):
-    effects = [effect for effect in calibration.model.effects if effect.section == section]
-    entries = {'effects': [effect.name for effect in effects]}
-    for effect in effects:
+def parameter_rows(calibration: 'Calibration') -> Iterator[tuple[str, ...]]:
+    """Yield the cells of each parameter in the order of `HEADINGS`."""
+    for effect in calibration.model.effects:
         part = calibration.model.slices[effect.key]
-        status = np.array(calibration.status, dtype=object)[part].reshape(effect.shape)
-        entries[effect.name] = {
-            'value': _plain(calibration.values[part].reshape(effect.shape)), 'sd': _plain(calibration.own_sd[part].reshape(effect.shape)),
-            'unit': effect.unit if isinstance(effect.unit, str) else list(effect.unit), 'status': status.tolist()}
-        centre = {group.name: calibration.model.centre[group.name] for group in effect.groups if group.name in calibration.model.centre}
-        if centre:
-            entries[effect.name]['centre'] = _plain(centre)
-        reasons = [calibration.held_reason.get(name, '') for name in effect.param_names()]
-        if any(reasons):
-            entries[effect.name]['held_reason'] = np.array(reasons, dtype=object).reshape(effect.shape).tolist()
-    return entries
+        for k, index in enumerate(range(part.start, part.stop)):
+            factor, unit = for_people(effect.unit_of(k), effect.sensor)
+            value, sd = with_sd(calibration.values[index] * factor, calibration.own_sd[index] * factor)
+            yield calibration.param_names[index], value, sd, unit, str(calibration.status[index])
+    if common := calibration.common_scale:
+        yield COMMON_SCALE, *with_sd(1.0, common['sd']), '1', str(common['status'])
 
 
-def _plain(value):
-    """Return value with arrays and numpy numbers turned into lists and Python numbers."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
-    return value
+def summary(calibration: 'Calibration') -> str:
+    """Return one line: the frame, the decisions, and how many parameters have which status."""
+    known = list(calibration.status_by_name.values())
+    counts = {status: known.count(status) for status in Status}
+    parts = ', '.join(f'{count} {status}' for status, count in counts.items() if count)
+    return f'<Calibration of {calibration.frame_id or "an IMU"}: {decisions_text(calibration.decisions)}, {parts}>'
 
 
-def from_mapping(document: Any) -> Calibration:
-    """
-    Return the calibration that a document describes.
-
-    Raises
-    ------
-    DocumentError
-        When the format is unknown or newer, a value is missing, not finite or implausible.
-
-    """
-    if not isinstance(document, dict):
-        raise DocumentError(f"a calibration document must be a mapping, got {type(document).__name__}; "
-                            "give a file written by 'imu_calibration calibrate'", code='not_a_mapping')
-    _check_format(document.get('format'))
-    check_parts(document)
-    try:
-        calibration = Calibration(**parts_of(document))
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, InputError) as error:
-        raise DocumentError(f'a calibration document must have the parts of {FORMAT}, one is missing or has another shape '
-                            f'({_one_line(error)}); calibrate again', code=getattr(error, 'code', '') or 'document_parts') from error
-    return check_numbers(calibration)
+def as_text(calibration: 'Calibration') -> str:
+    """Return the parameters as a table of plain text."""
+    rows = [HEADINGS, *parameter_rows(calibration)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    aligned = ('  '.join(cell.rjust(width) if heading in NUMBERS else cell.ljust(width)
+                         for cell, width, heading in zip(row, widths, HEADINGS))
+               for row in rows)
+    return '\n'.join([summary(calibration), *map(str.rstrip, aligned)])
 
 
-def _one_line(error):
-    return shortened(str(error) if isinstance(error, InputError) else f'{type(error).__name__}: {error}', 200)
-
-
-def _check_format(found):
-    name, _, number = str(found).partition('/')
-    if name != 'imu_calibration' or not number.isdigit():
-        raise DocumentError(f"a calibration document must have 'format: {FORMAT}', got {shortened(repr(found))}; "
-                            "give a file written by 'imu_calibration calibrate'", code='document_format')
-    if int(number) > int(FORMAT.partition('/')[2]):
-        raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got {shortened(repr(found))}; "
-                            "update imu_calibration", code='document_newer')
-
-
-def calibration_to_text(calibration: Calibration) -> str:
-    """Return a calibration as the YAML of its document."""
-    return to_text(to_mapping(calibration))
-
-
-def calibration_from_text(text: str) -> Calibration:
-    """
-    Return the calibration in a YAML document.
-
-    Raises
-    ------
-    DocumentError
-        When it is no calibration, newer, or implausible.
-
-    """
-    try:
-        mapping = from_text(text, 'calibration document')
-    except InputError as error:
-        raise DocumentError(str(error), code=error.code) from error
-    return from_mapping(mapping)
+def as_html(calibration: 'Calibration') -> str:
+    """Return the parameters as an HTML table, for notebooks."""
+    def row(cells: tuple[str, ...], tag: str) -> str:
+        style = [' style="text-align:right"' if heading in NUMBERS else ' style="text-align:left"' for heading in HEADINGS]
+        return '<tr>' + ''.join(f'<{tag}{s}>{escape(cell)}</{tag}>' for cell, s in zip(cells, style, strict=True)) + '</tr>'
+    body = ''.join(row(cells, 'td') for cells in parameter_rows(calibration))
+    return f'<table><caption>{escape(summary(calibration))}</caption>{row(HEADINGS, "th")}{body}</table>'

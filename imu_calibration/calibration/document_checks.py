@@ -3,18 +3,15 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imu_calibration.calibration.decision import HARMS, SensorDecision
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.nominal import with_nominal
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
-from imu_calibration.effects.named_models import BASE
+from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.errors import DocumentError, shortened
-
-if TYPE_CHECKING:
-    from imu_calibration.calibration.document import Calibration
 
 CONDITION_LIMIT = 20.0
 """A sensor matrix with a larger condition number cannot belong to three independent axes."""
@@ -125,7 +122,7 @@ def check_parts(document: Mapping, known: Mapping = KNOWN, place: str = '') -> N
                                 "correct the calibration file or calibrate again", code='part_value')
 
 
-def check_numbers(calibration: 'Calibration') -> 'Calibration':
+def check_numbers(calibration: Calibration) -> Calibration:
     """
     Return the calibration if its values are possible for an IMU.
 

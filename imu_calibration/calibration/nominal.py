@@ -2,21 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.status import HELD
 from imu_calibration.effects.base import SECTIONS, Role
-
-if TYPE_CHECKING:
-    from imu_calibration.calibration.document import Calibration
 
 READINGS = {'accelerometer': {'force'}, 'gyroscope': {'rate', 'angular acceleration'}}
 """Sensor -> items of `ColumnGroup.uses` that are computed from its readings to correct the other sensor."""
 
 
-def with_nominal(calibration: 'Calibration', sensors: Sequence[str]) -> 'Calibration':
+def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibration:
     """
     Return a calibration without correction of the given sensors.
 

@@ -7,8 +7,7 @@ import numpy as np
 from imu_calibration.allan.figures import NoiseFigures, bias_processes
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.effects.named_models import DEFAULT, parse_effects, parse_reference, with_common_arm
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import DEFAULT, SensorModel, parse_effects, parse_reference, with_common_arm
 from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.reference.table import Table
 from imu_calibration.samples import NominalScaling

@@ -1,28 +1,9 @@
-"""Statements about a calibration: decisions, warnings and notes, with the next step."""
+"""Words and figures that the statements about a calibration share."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import StrEnum
 
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.effects.base import SENSORS
-from imu_calibration.errors import with_hint
 
-
-class StatementKind(StrEnum):
-    """Kind of a statement."""
-
-    DECISION = 'decision'
-    """The decision on a sensor."""
-    PARAMETERS = 'parameters'
-    """How many parameters are within their tolerance, or which are not."""
-    WARNING = 'warning'
-    """A finding that the user should follow up."""
-    NOTE = 'note'
-    """A remark."""
-
-
-DECISION, PARAMETERS, WARNING, NOTE = StatementKind
 MISFIT = 10.0
 """Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
 LOOSE = 2.0
@@ -33,24 +14,6 @@ HAND_AXES = 'accelerometer_lower_triangular'
 """The axes of a calibration by hand."""
 
 
-@dataclass(frozen=True)
-class Reason:
-    """One statement about the calibration."""
-
-    word: StatementKind
-    """Its kind."""
-    what: str
-    """The statement."""
-    next: str
-    """The next step; empty when no action is needed."""
-    key: str | None = None
-    """The input needed for it, a key of `errors.KEYS`."""
-    sensors: tuple[str, ...] = SENSORS
-    """Sensors with parameters that it concerns."""
-
-    def advice(self, hints: dict[str, str] | None = None) -> str:
-        """Return the next step with the local name of its key (`errors.with_hint`); empty for none."""
-        return with_hint(self.next, self.key, hints or {}) if self.next else ''
 
 
 def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:

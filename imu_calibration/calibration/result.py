@@ -8,14 +8,69 @@ import numpy as np
 
 from imu_calibration.calibration.decision import HELPS, most_cautious
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceErrors
 from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.statements import Verdict
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.trust import usage
-from imu_calibration.calibration.verdict import Verdict
-from imu_calibration.calibration.window_errors import WindowErrors
+from imu_calibration.constants import ARCMIN
 from imu_calibration.segmentation.window import Window
+from imu_calibration.settings import setting
+
+
+@dataclass(frozen=True, eq=False)
+class WindowErrors:
+    """One row per window; errors are readings minus true values, in SI."""
+
+    time: np.ndarray
+    """Middle of the window, s, shape (n,)."""
+    kind: np.ndarray
+    """'static', 'spin' or 'dynamic', shape (n,)."""
+    measured: dict
+    """Sensor -> mean reading, shape (n, 3)."""
+    true: dict
+    """Sensor -> mean specific force or rate as the reference has it, shape (n, 3)."""
+    before: dict
+    """Sensor -> error of the mean reading, shape (n, 3)."""
+    after: dict
+    """Sensor -> error of the corrected mean, shape (n, 3)."""
+    floor: dict
+    """Sensor -> sd of the mean from noise, shape (n, 3)."""
+
+    def rms(self, sensor: str, which: str, kind: str | None = None) -> float:
+        """Return the root mean square error of 'before' or 'after', over windows of one kind or all."""
+        errors = getattr(self, which)[sensor][(self.kind == kind) if kind else slice(None)]
+        return float(np.sqrt(np.mean(errors**2))) if errors.size else float('nan')
+
+
+@dataclass(frozen=True)
+class ReferenceErrors:
+    """Standard deviations of the parts of the reference."""
+
+    levelling: float = setting(2 * ARCMIN, 'rad', 'levelling of the table, each of two directions; counts when table_tilt is not estimated',
+                               (0.0, 0.1))
+    joint_position: float = setting(10 * ARCMIN / 60, 'rad', 'position of each joint, independent in every window', (0.0, 0.1))
+    rate: float = setting(1e-4, '1', 'relative error of the table rate (its clock), common to all windows', (0.0, 0.1))
+    gravity: float = setting(5e-4, 'm/s^2',
+                             'local gravity, if the table description gives gravity without gravity_sd',
+                             (0.0, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorBudget:
+    """Standard deviation of each parameter by cause."""
+
+    param_names: tuple
+    """Names in the order of the rows."""
+    causes: dict
+    """Cause -> standard deviations, shape (n_params,); 'noise' first."""
+    texts: dict
+    """Cause -> assumption."""
+
+    @property
+    def total(self) -> np.ndarray:
+        """All causes together, shape (n_params,)."""
+        return np.sqrt(sum(part**2 for part in self.causes.values()))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,21 +1,240 @@
-"""The result of a calibration on a table."""
+"""
+The result of a calibration on a table, and its error budget after section V of Avrutov 2017.
 
-from dataclasses import dataclass
+The paper sums errors of the reference and of the outputs as if they were independent, with sign. Noise gives the covariance of the
+solution; a wrong reference that changes the predicted output by ``dA c`` moves the parameters by ``G^+ dA c``, where errors of the rows
+are common when the table is not level and independent when an encoder is read in every pose.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
-from imu_calibration.calibration.error_budget import ErrorBudget, ReferenceErrors, error_budget
-from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.window_errors import WindowErrors, window_residuals
+from imu_calibration.calibration.result import CalibrationResult, ErrorBudget, ReferenceErrors, WindowErrors
+from imu_calibration.constants import ARCMIN
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.forward_equations import predict
+from imu_calibration.effects.columns import References, columns, warped_reference
+from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients, predict, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.accumulator import restrict
+from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.observability import tolerance_scaled_singular_values
-from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.prior import fixed_parameters, make_prior
+from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.reference.perturbed_table import tilt
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
+
+MOVING_SAMPLES = 20_000
+"""Most samples of moving windows that are used; they are subsampled evenly beyond it."""
+
+
+
+
+
+
+def error_budget(result: 'TableResult', errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
+    """
+    Return the ErrorBudget of a calibration on a table.
+
+    First order, around the solution; weights of the solver. All windows at rest are used, and the moving windows with kept
+    samples.
+
+    Parameters
+    ----------
+    result : TableResult
+    errors : ReferenceErrors
+
+    """
+    table = result.table
+    gravity_sd = errors.gravity if table.gravity is not None and table.gravity_sd is None else table.gravity_sd_value
+    causes, texts = {'noise': result.solution.sd}, {'noise': 'noise and wander of the sensors, as this recording shows them'}
+    declared = _causes(result, errors, gravity_sd)
+    shifts = parameter_shifts(result, [change for _, _, _, changes in declared for change in changes])
+    start = 0
+    for name, text, scattered, changes in declared:
+        moved = shifts[start:start + len(changes)]
+        total = moved**2 if scattered else moved.sum(axis=1, keepdims=True)**2
+        causes[name], texts[name] = np.sqrt(total.sum(axis=(0, 1))), text
+        start += len(changes)
+    return ErrorBudget(tuple(result.solution.param_names), causes, texts)
+
+
+def _causes(result, errors, gravity_sd):
+    """Return (name, text, scattered, changes); a change maps (table, motion) to values that differ by one sd."""
+    found = []
+    if result.solution.model.find('reference', Role.TILT) is None:
+        text = f'levelling {errors.levelling / ARCMIN:.2g} arcmin in each direction, not estimated'
+        found.append(('levelling', text, False, [_Tilted(errors.levelling * np.eye(2)[k]) for k in range(2)]))
+    text = f'joint positions {errors.joint_position / ARCMIN * 60:.2g} arcsec, independent in every window'
+    found.append(('joint position', text, True, [_Turned(errors.joint_position, k) for k in range(len(result.table.joints))]))
+    found.append(('table rate', f'rate wrong by {errors.rate:.2g} of itself in all windows', False, [_Faster(errors.rate)]))
+    found.append(('gravity', f'gravity known to {gravity_sd:.2g} m/s²', False, [_Heavier(gravity_sd)]))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Tilted:
+    angles: np.ndarray
+
+    def __call__(self, table, motion):
+        return tilt(table, self.angles), motion
+
+
+@dataclass(frozen=True)
+class _Turned:
+    angle: float
+    joint: int
+
+    def __call__(self, table, motion):
+        return table, replace(motion, position=motion.position + self.angle * np.eye(motion.position.shape[1])[self.joint])
+
+
+@dataclass(frozen=True)
+class _Faster:
+    share: float
+
+    def __call__(self, table, motion):
+        factor = 1 + self.share
+        return table, replace(motion, rate=factor * motion.rate, acceleration=factor**2 * motion.acceleration)
+
+
+@dataclass(frozen=True)
+class _Heavier:
+    change: float
+
+    def __call__(self, table, motion):
+        return replace(table, gravity=table.gravity_value + self.change), motion
+
+
+def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.ndarray:
+    """
+    Return how each window's share of each change moves the parameters, shape (n_changes, n_windows, n_params).
+
+    Summed over windows: the shift of the estimate when all windows err together. A shift is estimate minus truth.
+    """
+    solution = result.solution
+    pieces = [_piece(result, changes, *source) for source in _sources(result)]
+    free = ~fixed_parameters(solution.model) & ~solution.held
+    prior = make_prior(solution.model)
+    normal = prior.root.T @ prior.root
+    right = np.zeros((len(changes), len(pieces), len(solution.values)))
+    for sensor in SENSORS:
+        design = np.array([piece.mean[sensor] for piece in pieces])
+        weighted = _whitening(solution.noise[sensor], pieces).weigh(design)
+        for axis in range(3):
+            normal = normal + weighted[:, axis].T @ design[:, axis]
+            for k, piece in enumerate(pieces):
+                normal += piece.within[sensor][axis]
+                right[:, k] += np.outer(piece.change[sensor][:, axis], weighted[k, axis]) + piece.within_change[sensor][:, axis]
+    index = np.flatnonzero(free)
+    shifts = np.zeros_like(right)
+    shifts[:, :, index] = right[:, :, index] @ inverse_normal(normal[np.ix_(index, index)])
+    return shifts
+
+
+def _whitening(noise, pieces):
+    """Return the `Whitening` of the means of the windows."""
+    variance = noise.mean_variance([p.kind for p in pieces], np.array([p.count for p in pieces])) + noise.offset_sd**2
+    return Whitening(variance, np.array([p.time for p in pieces]), sessions_of(pieces), processes=noise.bias_processes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """One window: design and changes of the output, mean and centred, weighted where centred."""
+
+    kind: str
+    """'static', 'spin' or 'dynamic'."""
+    time: float
+    """Middle, s."""
+    session: int
+    """Recording."""
+    count: float
+    """Samples."""
+    mean: dict
+    """Sensor -> mean design of each axis, shape (3, n_params)."""
+    within: dict
+    """Sensor -> products of the centred design, shape (3, n_params, n_params)."""
+    change: dict
+    """Sensor -> mean change of the output, shape (n_changes, 3)."""
+    within_change: dict
+    """Sensor -> centred design times centred change, shape (n_changes, 3, n_params)."""
+
+
+def _sources(result):
+    """Yield (kind, time, session, count, stride, motion, temperature) of the windows at rest and of the moving ones that were kept."""
+    rows = {(row.session, row.time): row.count for row in result.gathered.accumulator.rows if row.kind == 'static'}
+    typical = float(np.median(list(rows.values()))) if rows else 1.0
+    zero = np.zeros((1, len(result.table.joints)))
+    for time, session, position in result.gathered.poses:
+        motion = JointMotion(np.array([time]), np.asarray(position)[None], zero, zero, zero)
+        yield 'static', time, session, rows.get((session, time), typical), 1, motion, None
+    stride = max(1, int(np.ceil(sum(len(w) for w in result.gathered.kept) / MOVING_SAMPLES)))
+    for number, window in enumerate(result.gathered.kept):
+        some = slice(None, None, stride)
+        temperature = None if window.temperature_c is None else window.temperature_c[some]
+        yield window.kind, float(window.time.mean()), 0, len(window), stride, window.motion.select(some), temperature
+
+
+def _piece(result, changes, kind, time, session, count, stride, motion, temperature):
+    model, values, table = result.solution.model, result.solution.values, result.table
+    temperature = _known(model, motion, temperature)
+    parts = {name: {} for name in ('mean', 'within', 'change', 'within_change')}
+    references = References(model, table, motion, temperature_c=temperature)
+    for sensor in SENSORS:
+        ref = references.at(sensor)
+        design = columns(model, sensor, table, motion=motion, temperature_c=temperature, references=references)
+        slope = coefficient_jacobian(model, sensor, values)
+        output = sensor_output(model, sensor, values, ref=ref)
+        moved = np.array([_output(model, sensor, values, *change(table, motion),
+                                  temperature) - output for change in changes]).reshape(-1, len(motion), 3)
+        mean = design.mean(axis=0)
+        parts['mean'][sensor] = np.einsum('q,qap->ap', mean, slope)
+        parts['change'][sensor] = moved.mean(axis=1)
+        variance = result.solution.noise[sensor].row_variance(kind) / stride
+        centred = design - mean
+        rest = moved - moved.mean(axis=1, keepdims=True)
+        gram, cross = centred.T @ centred, np.einsum('nq,kna->kaq', centred, rest)
+        parts['within'][sensor] = np.stack([slope[:, a].T @ gram @ slope[:, a] / variance[a] for a in range(3)])
+        parts['within_change'][sensor] = np.stack([cross[:, a] @ slope[:, a] / variance[a] for a in range(3)], axis=1)
+    return _Piece(kind, time, session, count, **parts)
+
+
+def _known(model, motion, temperature):
+    """Return temperatures if the model needs them; the mean at rest is not kept, so that the reference temperature is used there."""
+    return np.full(len(motion), model.temperature_ref_c) if model.needs_temperature and temperature is None else temperature
+
+
+def _output(model, sensor, values, table, motion, temperature):
+    return sensor_output(model, sensor, values, ref=warped_reference(model, sensor, table, motion=motion, temperature_c=temperature))
+
+
+def window_residuals(result: 'TableResult') -> dict:
+    """
+    Return residuals per window before and after calibration: those of a nominal sensor, and those of the model.
+
+    Returns
+    -------
+    dict
+        'time', 'kind', 'count', and per sensor 'before', 'after', each shape (n_windows, 3): residuals of window means.
+
+    """
+    solution, rows = result.solution, result.gathered.accumulator.rows
+    wide, narrow = result.gathered_model, result.model
+    accumulator = result.gathered.accumulator if wide is narrow else restrict(result.gathered.accumulator, wide, narrow)
+    found = {'time': np.array([r.time for r in rows]), 'kind': [r.kind for r in rows], 'count': np.array([r.count for r in rows])}
+    nominal = narrow.start()
+    for sensor in SENSORS:
+        means = np.array([row.sensors[sensor].mean for row in accumulator.rows])
+        after, before = (coefficients(narrow, sensor, values) for values in (solution.values, np.where(np.isfinite(nominal), nominal, 0.0)))
+        found[sensor] = {'before': means[:, -3:] - means[:, :-3] @ before, 'after': means[:, -3:] - means[:, :-3] @ after,
+                         'measured': means[:, -3:], 'predicted': means[:, :-3] @ after}
+    return found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,81 +1,23 @@
 """The verdict on a calibration: the decision per sensor, the parameters within tolerance, warnings, and the next steps."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from imu_calibration.calibration.decision import (
     HELPS,
     UNPROVEN,
-    SensorDecision,
     decide,
-    decisions_text,
     helps_everywhere,
-    most_cautious,
     reason_of,
 )
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.plausibility import beyond_known, implausible
-from imu_calibration.calibration.reasons import (
-    DECISION,
-    MISFIT,
-    NOTE,
-    PARAMETERS,
-    WARNING,
-    Reason,
-    listed,
-    misfit_ratios,
-    quiet,
-    rested,
-)
+from imu_calibration.calibration.reasons import MISFIT, listed, misfit_ratios, quiet, rested
+from imu_calibration.calibration.statements import DECISION, PARAMETERS, WARNING, Reason, Verdict, lines_of
 from imu_calibration.calibration.status import COMMON_SCALE, DETERMINED, HELD, Status
 from imu_calibration.calibration.verdict_notes import notes_on
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The decisions with all statements, the most important first."""
-
-    decisions: dict[str, SensorDecision]
-    """Sensor -> decision."""
-    reasons: tuple[Reason, ...]
-    """Decisions, parameters, warnings, notes."""
-    within: int
-    """Requested parameters that are determined."""
-    requested: int
-    """Requested parameters."""
-    limiting: tuple[str, float]
-    """The requested parameter with the largest sd in units of its tolerance, and that ratio; ('', 0) without any."""
-
-    @property
-    def word(self) -> SensorDecision:
-        """The more cautious of the decisions."""
-        return most_cautious(self.decisions.values())
-
-    @property
-    def complete(self) -> bool:
-        """Whether each sensor helps and every requested parameter is determined."""
-        return self.word is HELPS and self.within == self.requested
-
-    @property
-    def text(self) -> str:
-        """The decisions in one phrase."""
-        return decisions_text(self.decisions)
-
-    def lines(self, hints: dict[str, str] | None = None) -> list[str]:
-        """Return the statements and next steps, a line each; `hints` as for `errors.with_hint`."""
-        return lines_of(self.reasons, hints)
-
-
-def lines_of(reasons: Iterable[Reason], hints: dict[str, str] | None = None) -> list[str]:
-    """Return statements and next steps, a line each; `hints` as for `errors.with_hint`."""
-    lines = []
-    for reason in reasons:
-        lines.append(f'{reason.word}: {reason.what}' if reason.word in (WARNING, NOTE) else reason.what)
-        lines += [f'next: {reason.advice(hints)}'] if reason.next else []
-    return list(dict.fromkeys(lines))
 
 
 def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:

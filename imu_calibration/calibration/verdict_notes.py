@@ -4,7 +4,8 @@ import numpy as np
 
 from imu_calibration.calibration.decision import worse_regimes
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.reasons import HAND_AXES, LOOSE, MISFIT, NOTE, SHOWN_NAMES, WARNING, Reason, misfit_ratios, quiet, rested
+from imu_calibration.calibration.reasons import HAND_AXES, LOOSE, MISFIT, SHOWN_NAMES, misfit_ratios, quiet, rested
+from imu_calibration.calibration.statements import NOTE, WARNING, Reason
 from imu_calibration.calibration.uncorrected import uncorrected_lines
 from imu_calibration.effects.base import SENSORS, UNIT, Role
 from imu_calibration.segmentation.window import UnusedReason

@@ -4,8 +4,8 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from imu_calibration.calibration.document import HEADINGS, NUMBERS, parameter_rows
 from imu_calibration.calibration.result import summary
-from imu_calibration.calibration.shown import HEADINGS, NUMBERS, parameter_rows
 from imu_calibration.errors import printable, with_hint
 from imu_calibration.preflight.evidence import CheckFinding, Severity
 from imu_calibration.use_cases.calibrate import Calibrated

@@ -1,7 +1,7 @@
 """From windows to findings: the function that tests every effect and describes the findings."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Callable, Sequence
 
 import numpy as np
 

@@ -1,7 +1,6 @@
 """One chosen effect as a finding, the same on a table and by hand."""
 
-from collections.abc import Sequence
-from typing import Callable
+from collections.abc import Callable, Sequence
 
 from imu_calibration.calibration.plausibility import beyond_known
 from imu_calibration.diagnosis.result import Finding, parameters_of

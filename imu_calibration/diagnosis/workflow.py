@@ -23,7 +23,7 @@ from imu_calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST
 from imu_calibration.diagnosis.traces import residual_traces
 from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
 from imu_calibration.effects.lags import total_lags
-from imu_calibration.effects.named_models import BARE
+from imu_calibration.effects.sensor_model import BARE
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.reference.table import Table
 from imu_calibration.selection.investigation import too_few_windows

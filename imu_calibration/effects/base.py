@@ -1,8 +1,9 @@
 """The effect: one physical cause of sensor output, declared once."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Any, Callable
+from typing import Any
 
 import numpy as np
 
@@ -130,13 +131,6 @@ class Effect:
     """Whether it is a nuisance parameter, estimated but not requested."""
     definition: dict | None = None
     """The plain data that it was made of (`effects.term`), which may travel in documents; None for the catalogue's own."""
-
-    def __reduce__(self):
-        """Travel to other processes by the definition, where there is one."""
-        if self.definition is None:
-            return super().__reduce__()
-        from imu_calibration.effects.term import from_definition
-        return from_definition, (self.name, self.definition)
 
     @property
     def key(self) -> tuple[str, str]:

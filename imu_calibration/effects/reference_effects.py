@@ -10,11 +10,9 @@ from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import MATRIX, Effect, Role
 from imu_calibration.effects.lags import LAGS
 from imu_calibration.effects.regressors import ATTITUDE, LOAD, PAIRS
-from imu_calibration.reference.axis_angles import with_axis_angles, with_axis_places
 from imu_calibration.reference.joint import JointNames
 from imu_calibration.reference.joint_motion import shifted, with_encoder_harmonics
-from imu_calibration.reference.leaning_axes import WOBBLES, with_sag, with_wobble
-from imu_calibration.reference.levelling import tilt
+from imu_calibration.reference.perturbed_table import WOBBLES, tilt, with_axis_angles, with_axis_places, with_sag, with_wobble
 
 EVEN_AND_ODD = [(i, j, k, 1.0 if (j - i) % 3 == 1 else -1.0) for i in range(3) for j in range(3) for k in range(3) if len({i, j, k}) == 3]
 """Axes i, j, k of a cross product with their sign."""

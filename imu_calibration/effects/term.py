@@ -1,5 +1,6 @@
 """Effects defined by plain data: a column as text, and its description. They are written to documents and sent to other processes."""
 
+import copyreg
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -125,3 +126,11 @@ def from_definition(name: str, definition: dict[str, Any]) -> Effect:
     except TypeError as error:
         raise InputError(f"effect '{name}' must have sensor, column, unit, tolerance and text, got {definition!r:.200} ({error}); "
                          "correct it", code='definition_keys') from error
+
+
+def _reduced(effect):
+    """Return how an effect is sent to other processes: by its definition if there is one, because `coefficients` hold functions."""
+    return object.__reduce_ex__(effect, 2) if effect.definition is None else (from_definition, (effect.name, effect.definition))
+
+
+copyreg.pickle(Effect, _reduced)

@@ -1,7 +1,7 @@
 """The noise of one sensor: white noise within windows, offsets of windows, bias processes, excess variance of moving windows."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Sequence
 
 import numpy as np
 

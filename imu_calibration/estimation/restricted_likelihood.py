@@ -1,6 +1,6 @@
 """Restricted likelihood of the means of windows as a function of the noise, over all parameters or some of them."""
 
-from typing import Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import lapack

@@ -1,8 +1,8 @@
 """The triangular factor of rows: an exact summary of any number of them for least squares."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Sequence
 
 import numpy as np
 from scipy.linalg import lapack

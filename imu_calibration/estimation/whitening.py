@@ -1,6 +1,6 @@
 """Whitening of window means with errors correlated in time: independent rows of unit variance, in linear time."""
 
-from typing import Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import lapack

@@ -1,7 +1,7 @@
 """One window of data, reduced to its statistics for least squares."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Callable, Sequence
 
 import numpy as np
 

@@ -1,7 +1,7 @@
 """A bounded store of windows, for effects that are linearised again without a second pass over the recording."""
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Iterator
 
 import numpy as np
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from imu_calibration.calibration.coverage import bars_of
-from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.calibration.document_parts import calibration_to_text
 from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.pacing import SolvePacer
 from imu_calibration.calibration.result import CalibrationResult, summary

@@ -24,7 +24,8 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from imu_calibration import files
-from imu_calibration.calibration.document import Calibration, calibration_from_text
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.document_parts import calibration_from_text
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.driving.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect, separator_of
 from imu_calibration.driving.driver import Driver, DriverSettings

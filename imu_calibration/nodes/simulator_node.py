@@ -21,10 +21,10 @@ from trajectory_msgs.msg import JointTrajectory
 
 from imu_calibration import files
 from imu_calibration.calibration.decision import BY_DEFINITION
-from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.document_parts import calibration_to_text
 from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.effects.named_models import NAMED_MODELS
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.hints import HINTS

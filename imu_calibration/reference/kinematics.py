@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from imu_calibration.reference.axis_angles import axis_error_directions
 from imu_calibration.reference.earth import earth_rate_n
-from imu_calibration.reference.leaning_axes import wobble_at
+from imu_calibration.reference.perturbed_table import wobble_at
 from imu_calibration.reference.reference_motion import Reference, align, rotation
+from imu_calibration.reference.table import axis_error_directions
 
 if TYPE_CHECKING:
     from imu_calibration.reference.joint_motion import JointMotion

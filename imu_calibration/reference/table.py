@@ -1,14 +1,15 @@
 """The turntable or arm that carries the sensor: its description, checked."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
-from typing import Any
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from imu_calibration.errors import InputError
-from imu_calibration.reference.axis_angles import axis_angles
 from imu_calibration.reference.earth import NORMAL_GRAVITY_ACCURACY, normal_gravity
 from imu_calibration.reference.joint import (
     Joint,
@@ -22,6 +23,64 @@ from imu_calibration.reference.joint import (
     unit_vector,
 )
 from imu_calibration.reference.reference_motion import align, rotation_from_rpy
+
+PARALLEL = 0.02
+"""Sine of the angle up to which two axes count as parallel: their common perpendicular is undefined there."""
+
+
+class AxisAngle(NamedTuple):
+    """One angular error of an axis relative to the preceding axis."""
+
+    name: str
+    """The two joints; with u or v where the axes are parallel."""
+    joint: int
+    """Index of the joint whose axis turns."""
+    direction: np.ndarray
+    """Unit vector about which it turns, in the joint's frame, shape (3,)."""
+
+
+@lru_cache(maxsize=64)
+def axis_angles(joints: tuple[Joint, ...]) -> tuple[AxisAngle, ...]:
+    """
+    Return the angles between each turning axis and the one before it.
+
+    Two axes enclose one angle, about their common perpendicular; the other direction in which the second may stand wrong is the zero
+    of the first joint. Parallel axes have no such perpendicular: there are two angles, about `axis_error_directions`, and the zeros
+    of their joints are one (Hayati and Mirmirani 1985).
+    """
+    found, before, name = [], None, ''
+    for index, joint in enumerate(joints):
+        # The axis of the turning joint before, brought along from frame to frame with all joints at zero.
+        before = None if before is None else joint.mat_before.T @ before
+        if not joint.turns:
+            continue
+        axis = np.array(joint.axis)
+        if before is not None:
+            found += _between(f'{name}_{joint.name}', index, before, axis)
+        before, name = axis, joint.name
+    return tuple(found)
+
+
+def _between(name, index, before, axis):
+    normal = np.cross(before, axis)
+    sine = np.linalg.norm(normal)
+    if sine > PARALLEL:
+        return [AxisAngle(name, index, normal / sine)]
+    return [AxisAngle(f'{name}_{letter}', index, direction) for letter, direction in zip('uv', axis_error_directions(axis), strict=True)]
+
+
+def axis_error_directions(axis: np.ndarray) -> np.ndarray:
+    """
+    Return two unit vectors u, v that form a right-handed triad u, v, axis; shape (2, 3).
+
+    u is the coordinate axis that lies farthest from `axis` (the first of equals), made orthogonal to it; v = axis x u.
+    """
+    axis = np.asarray(axis, float)
+    start = np.eye(3)[np.argmin(np.round(np.abs(axis), 6))]
+    first = start - axis * (axis @ start)
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(axis, first)])
+
 
 _MOUNT_KEYS = ('rpy_deg', 'xyz')
 

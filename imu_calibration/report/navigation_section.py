@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.window_errors import WindowErrors
+from imu_calibration.calibration.result import CalibrationResult, WindowErrors
 from imu_calibration.compensation.compensate import compensate
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.effects.base import Role

@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.window_errors import WindowErrors
+from imu_calibration.calibration.result import CalibrationResult, WindowErrors
 from imu_calibration.papers.zhang2017 import axis_readings
 from imu_calibration.report.numbers import fixed, text
 

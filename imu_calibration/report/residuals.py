@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.window_errors import WindowErrors
+from imu_calibration.calibration.result import CalibrationResult, WindowErrors
 from imu_calibration.effects.base import SENSORS, UNIT
 from imu_calibration.report.drawn import Drawn
 from imu_calibration.report.figures import AXIS, GREY, MARKER, axis_legend, draw

@@ -1,9 +1,10 @@
 """The recording reduced around a point of linearisation, the search on it, and the decision whether to relinearise."""
 
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
-from typing import AbstractSet, Callable, Sequence
+from typing import AbstractSet
 
 import numpy as np
 

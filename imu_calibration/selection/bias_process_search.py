@@ -1,6 +1,6 @@
 """The likeliest offsets and bias process of a sensor, given some of the candidate effects."""
 
-from typing import Callable, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 

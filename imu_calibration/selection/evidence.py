@@ -1,9 +1,9 @@
 """How well a choice of parameters predicts windows that it was not fitted to: small problems on normal matrices."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Sequence
 
 import numpy as np
 

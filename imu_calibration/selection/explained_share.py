@@ -1,6 +1,6 @@
 """Share of the excess over noise that the chosen effects remove; prevents findings that stand in for a cause outside the catalogue."""
 
-from typing import Callable, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 

@@ -1,7 +1,7 @@
 """The extended model, solved on all windows by the same solver that calibrates."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Sequence
 
 import numpy as np
 

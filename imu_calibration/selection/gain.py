@@ -1,7 +1,7 @@
 """Gain of the extended model in predicting held-out windows; the locked ones were also excluded from its selection."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Sequence
 
 import numpy as np
 

@@ -1,8 +1,8 @@
 """The search from windows to named effects: remove clipped samples, linearise, choose, prove, relinearise."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Callable, Sequence
 
 import numpy as np
 

@@ -1,6 +1,6 @@
 """Normal matrices ``[design | residual]' V^-1 [design | residual]`` of windows of a reduced recording, weighed with a noise."""
 
-from typing import Sequence
+from collections.abc import Sequence
 
 import numpy as np
 

@@ -1,8 +1,8 @@
 """From columns to parameters: each window's contribution to a linear problem in the parameters of all candidate effects."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Iterator, Sequence
 
 import numpy as np
 

@@ -1,7 +1,7 @@
 """Testable effects of a recording; for each untestable effect the reason."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Callable, Sequence
 
 import numpy as np
 

@@ -1,8 +1,8 @@
 """A recording reduced with the columns of all candidate effects: sufficient for candidates, folds and resamples."""
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Callable, Iterator, Sequence
 
 import numpy as np
 

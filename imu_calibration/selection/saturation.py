@@ -1,7 +1,7 @@
 """Saturation: a limit that outputs pile up at, and the samples that it spoils."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Sequence
 
 import numpy as np
 

@@ -1,8 +1,9 @@
 """Choosing effects one after the other by held-out evidence, with earlier choices reconsidered after each step."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import AbstractSet, Sequence
+from typing import AbstractSet
 
 import numpy as np
 

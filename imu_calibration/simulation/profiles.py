@@ -1,9 +1,9 @@
 """Named motions of a turntable, for the verb simulate and the simulator node."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Callable
+from typing import Any
 
 import numpy as np
 

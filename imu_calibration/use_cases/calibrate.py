@@ -12,9 +12,11 @@ from imu_calibration import files
 from imu_calibration.by_hand.workflow import calibrate_without_table
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.check import check_on_table
-from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.document_parts import calibration_to_text
 from imu_calibration.calibration.result import CalibrationResult, exit_code, summary
-from imu_calibration.calibration.verdict import Verdict, judged
+from imu_calibration.calibration.statements import Verdict
+from imu_calibration.calibration.verdict import judged
 from imu_calibration.errors import InputError
 from imu_calibration.progress import counter, report
 from imu_calibration.samples import SampleBlock

@@ -18,8 +18,7 @@ from imu_calibration.calibration.calibrate import calibration_of_saved
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.named_models import BASE, parse_effects
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import BASE, SensorModel, parse_effects
 from imu_calibration.errors import DocumentError, InputError
 from imu_calibration.planning.planner import Plan, make_planner, plan_to_mapping, trajectory_to_mapping
 from imu_calibration.planning.separation import make_separator

@@ -11,12 +11,12 @@ import numpy as np
 
 from imu_calibration import documents, files
 from imu_calibration.calibration.decision import BY_DEFINITION
-from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.document_parts import calibration_to_text
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import Catalogue
-from imu_calibration.effects.named_models import NAMED_MODELS
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file

@@ -2,7 +2,7 @@
 
 import pytest
 
-from imu_calibration.calibration.reasons import WARNING
+from imu_calibration.calibration.statements import WARNING
 from imu_calibration.reference.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.decision import HELPS, UNPROVEN
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.reasons import DECISION, NOTE, PARAMETERS, WARNING
-from imu_calibration.calibration.shown import parameter_rows
+from imu_calibration.calibration.document import Calibration, parameter_rows
+from imu_calibration.calibration.statements import DECISION, NOTE, PARAMETERS, WARNING
 from imu_calibration.calibration.status import DETERMINED, HELD, WEAK, tolerances_of
 from imu_calibration.calibration.verdict import judge, judged
 from imu_calibration.effects.sensor_model import SensorModel

@@ -17,8 +17,7 @@ from imu_calibration.diagnosis.sentences import sentence
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.column_group import ColumnGroup
 from imu_calibration.effects.expressions import PLACES, read
-from imu_calibration.effects.named_models import BASE
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.effects.term import term
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.reference.reference_motion import Reference

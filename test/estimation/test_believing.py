@@ -7,8 +7,7 @@ import pytest
 
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.effects.forward_equations import predict
-from imu_calibration.effects.named_models import parse_reference
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import SensorModel, parse_reference
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.shrinkage import shrunk
 from imu_calibration.estimation.solver import solve

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.reference.axis_angles import axis_error_directions, with_axis_angles
 from imu_calibration.reference.joint import Joint
 from imu_calibration.reference.joint_motion import JointMotion, with_encoder_harmonics
 from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.leaning_axes import WOBBLES, with_sag, with_wobble, wobble_at
-from imu_calibration.reference.table import Table
+from imu_calibration.reference.perturbed_table import WOBBLES, with_axis_angles, with_sag, with_wobble, wobble_at
+from imu_calibration.reference.table import Table, axis_error_directions
 
 FIELDS = ('force_s', 'rate_s', 'alpha_s', 'mat_sn')
 TIME = np.linspace(0.0, 7.0, 141)

@@ -12,14 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.errors import InputError
 from imu_calibration.files import read_table
-from imu_calibration.reference.axis_angles import axis_error_directions, with_axis_angles
 from imu_calibration.reference.earth import earth_rate_n, normal_gravity
 from imu_calibration.reference.joint import TYPES, Joint, Mimic
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.levelling import tilt
+from imu_calibration.reference.perturbed_table import tilt, with_axis_angles
 from imu_calibration.reference.reference_motion import skew
-from imu_calibration.reference.table import Table
+from imu_calibration.reference.table import Table, axis_error_directions
 from imu_calibration.resources import config_file
 
 THREE_AXES = {'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],

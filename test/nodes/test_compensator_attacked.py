@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.calibration.document_parts import calibration_to_text
 from imu_calibration.documents import version_of
 from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError

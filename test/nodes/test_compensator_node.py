@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.calibration.document_parts import calibration_to_text
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.documents import version_of
 from imu_calibration.nodes.message_compensation import LiveCompensation

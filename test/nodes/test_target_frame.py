@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.document import calibration_to_text
+from imu_calibration.calibration.document_parts import calibration_to_text
 from imu_calibration.samples import ImuSamples
 from msg_adapters.encode import encode_imu
 

@@ -8,14 +8,14 @@ import pytest
 import yaml
 from refusal import refused
 
-from imu_calibration.calibration.document import Calibration, calibration_to_text
+from imu_calibration.calibration.document import Calibration
+from imu_calibration.calibration.document_parts import calibration_to_text
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.cli.main import main
 from imu_calibration.effects.columns import columns
-from imu_calibration.effects.named_models import NAMED_MODELS
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.errors import InputError
 from imu_calibration.estimation.window_statistics import batch_statistics
 from imu_calibration.planning import belief

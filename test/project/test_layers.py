@@ -166,6 +166,19 @@ def test_a_class_name_means_one_thing():
     assert {name: found for name, found in homes.items() if len(found) > 1} == {}
 
 
+def test_no_modules_import_each_other(tmp_path):
+    """The same search as in `make lint`, which counts the cycles without a limit."""
+    sys.path.insert(0, str(ROOT / 'tools'))
+    try:
+        import weigh
+    finally:
+        sys.path.pop(0)
+    assert weigh.cycles(weigh.imports(ROOT, [*modules('imu_calibration'), *modules('msg_adapters')])) == []
+    for name, other in (('first', 'second'), ('second', 'first'), ('third', 'first')):
+        (tmp_path / f'{name}.py').write_text(f'def function():\n    from {other} import function\n')
+    assert [sorted(found) for found in weigh.cycles(weigh.imports(tmp_path, list(tmp_path.glob('*.py'))))] == [['first', 'second']]
+
+
 def test_modules_of_all_layers_were_found():
     names = set(map(module_name, [*modules('imu_calibration'), *modules('msg_adapters')]))
     assert {'imu_calibration.samples', 'imu_calibration.cli', 'imu_calibration.nodes', 'msg_adapters'} <= names

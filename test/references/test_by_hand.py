@@ -8,6 +8,7 @@ import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
+from imu_calibration.by_hand.advice import missing_motion
 from imu_calibration.by_hand.calibrate import calibrate_by_hand
 from imu_calibration.by_hand.equations import Poses, State, TurnData, build_system, moved
 from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence
@@ -277,8 +278,9 @@ def test_six_faces_leave_the_cross_axis_terms_held_and_say_what_to_do():
         assert status[full] == 'held' and found.value(full) == 0.0
         assert found.sd_of(full) == found.priors[found.param_names.index(full)]
     assert status['accelerometer.matrix.xx'] != 'held' and status['accelerometer.bias.z'] != 'held'
-    needs = found.advice[0]['needs']
-    assert set(found.advice[0]['parameters']) >= {f'accelerometer.matrix.{n}' for n in ('yx', 'zx', 'zy')}
+    advice = missing_motion(found)[0]
+    needs = advice['needs']
+    assert set(advice['parameters']) >= {f'accelerometer.matrix.{n}' for n in ('yx', 'zx', 'zy')}
     assert len({axis for _, axis in re.findall(r'([+-])([xyz])\b', needs)}) >= 2
 
 
@@ -289,7 +291,7 @@ def test_turns_about_one_axis_leave_the_others_weak_or_held():
     status = dict(zip(found.param_names, found.statuses))
     assert status['gyroscope.matrix.xx'] == 'determined'
     assert status['accelerometer.matrix.xx'] != 'determined'
-    axis = found.advice[-1]['needs'].split(' deg about its ')[1].split(' axis')[0]
+    axis = missing_motion(found)[-1]['needs'].split(' deg about its ')[1].split(' axis')[0]
     assert 'y' in axis or 'z' in axis   # a turn about x would show nothing new
 
 

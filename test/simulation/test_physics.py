@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.reference.earth import normal_gravity
 from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.levelling import tilt
+from imu_calibration.reference.perturbed_table import tilt
 from imu_calibration.reference.table import Table
 from imu_calibration.simulation.profiles import make_profile
 

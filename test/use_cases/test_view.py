@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.coverage_look import line_of
-from imu_calibration.calibration.document import UNKNOWN, calibration_to_text
+from imu_calibration.calibration.document import UNKNOWN
+from imu_calibration.calibration.document_parts import calibration_to_text
 from imu_calibration.calibration.residual_spectrum import residual_spectrum
 from imu_calibration.cli.main import main
 from imu_calibration.effects.base import SENSORS

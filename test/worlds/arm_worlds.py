@@ -16,10 +16,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.reference.axis_angles import with_axis_angles, with_axis_places
 from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.levelling import tilt
+from imu_calibration.reference.perturbed_table import tilt, with_axis_angles, with_axis_places
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.urdf import table_from_urdf
 from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock
