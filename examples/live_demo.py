@@ -43,8 +43,7 @@ class Watcher:
         from sensor_msgs.msg import Imu, JointState
         from std_msgs.msg import String
 
-        from imu_calibration.nodes.inputs import BatchInput
-        from imu_calibration.nodes.qos import latched_qos
+        from imu_calibration.nodes.inputs import BatchInput, latched_qos
         from msg_adapters.live import LiveGatherer
         self._rclpy, self._processes = rclpy, processes
         rclpy.init()
@@ -203,7 +202,7 @@ def picture(path, watcher, calibration, errors):
     matplotlib.use('Agg')
     import matplotlib.pyplot as plt
 
-    from imu_calibration.calibration.document_parts import calibration_from_text
+    from imu_calibration.calibration.document_text import calibration_from_text
     from imu_calibration.calibration.status import tolerances_of
     start = next(at for at, text, _ in watcher.drive if not text.startswith('idle'))
     figure, (known, left) = plt.subplots(2, 1, figsize=(9, 7), constrained_layout=True)

@@ -33,3 +33,22 @@ def norm_sf(x: ArrayLike) -> np.ndarray:
 def norm_ppf(chance: ArrayLike) -> np.ndarray:
     """Return the value below which a standard Gaussian number lies with probability `chance`."""
     return ndtri(chance)
+
+
+def chance_of_fall(fall: float, added: int, *, rest: float, spare: float) -> float:
+    """
+    Return the p-value of the fall of a sum of squares.
+
+    Parameters
+    ----------
+    fall : float
+        Fall of the sum of squares; a negative value counts as zero.
+    added : int
+        Parameters that were added.
+    rest : float
+        Residual sum of squares.
+    spare : float
+        Its degrees of freedom.
+
+    """
+    return float(fdtrc(added, spare, max(fall, 0.0) / added / max(rest / spare, 1e-12)))

@@ -19,7 +19,7 @@ from imu_calibration import documents
 from imu_calibration.allan.document import noise_from_text
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_from_text, checked_tolerances
+from imu_calibration.calibration.document_text import calibration_from_text, checked_tolerances
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.errors import InputError, shortened
 from imu_calibration.reference.table import Table

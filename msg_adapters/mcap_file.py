@@ -39,8 +39,7 @@ from msg_adapters.mcap_records import (
     unpack_chunk,
     walk,
 )
-from msg_adapters.read_ahead import read_ahead
-from msg_adapters.storage import StorageFile, Stretch
+from msg_adapters.storage import StorageFile, Stretch, read_ahead
 
 FIRST_BYTES = 1 << 16
 """Bytes read at once of messages outside of chunks; doubled up to `STRETCH_BYTES` while no other record is between them."""

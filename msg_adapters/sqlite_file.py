@@ -1,9 +1,9 @@
-"""rosbag2 sqlite3 storage: topics by SQL, messages straight from the pages, or row by row where that does not apply."""
+"""rosbag2 sqlite3 storage, read (topics by SQL, messages from the pages or row by row) and written (schema version 4)."""
 
 import os
 import sqlite3
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from functools import partial
 from itertools import islice
@@ -13,11 +13,11 @@ from urllib.parse import quote
 
 import numpy as np
 
+from msg_adapters.definitions import TypeDefinition
 from msg_adapters.layout import Packed
-from msg_adapters.read_ahead import read_ahead
 from msg_adapters.sqlite_pages import PageReader
 from msg_adapters.stamps import clean_name
-from msg_adapters.storage import StorageFile, Stretch
+from msg_adapters.storage import StorageFile, Stretch, read_ahead
 
 COLUMNS = ['id', 'topic_id', 'timestamp', 'data']
 STRETCH_ROWS = 8192
@@ -182,3 +182,54 @@ def _connect(path, logged):
     connection.execute('PRAGMA writable_schema = ON')
     connection.text_factory = partial(str, encoding='utf-8', errors='replace')
     return connection
+
+
+SCHEMA = (
+    'CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL)',
+    'CREATE TABLE metadata(id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL)',
+    'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL, '
+    'offered_qos_profiles TEXT NOT NULL, type_description_hash TEXT NOT NULL)',
+    'CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, encoding TEXT NOT NULL, '
+    'encoded_message_definition TEXT NOT NULL, type_description_hash TEXT NOT NULL)',
+    'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL)',
+)
+
+
+class SqliteWriter:
+    """Writes one new file, which must not be opened elsewhere before `close`."""
+
+    def __init__(self, path: Path, ros_distro: str):
+        self.connection = sqlite3.connect(path, isolation_level=None)
+        # The file is made under another name and deleted on failure: a journal would have no benefit.
+        for pragma in ('journal_mode = OFF', 'synchronous = OFF', 'locking_mode = EXCLUSIVE', 'cache_size = -16000'):
+            self.connection.execute('PRAGMA ' + pragma)
+        self.connection.execute('BEGIN')
+        for statement in SCHEMA:
+            self.connection.execute(statement)
+        self.connection.execute('INSERT INTO schema VALUES (4, ?)', (ros_distro,))
+
+    def add_topic(self, topic_id: int, name: str, definition: TypeDefinition, *, qos: str) -> None:
+        """Declare a topic; `definition` is a TypeDefinition."""
+        self.connection.execute('INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)',
+                                (topic_id, name, definition.type, 'cdr', qos, definition.digest))
+        known = self.connection.execute('SELECT 1 FROM message_definitions WHERE topic_type = ?', (definition.type,)).fetchone()
+        if not known and definition.text:
+            self.connection.execute(
+                'INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash) '
+                'VALUES (?, ?, ?, ?)', (definition.type, definition.encoding, definition.text, definition.digest))
+
+    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Sequence[memoryview]) -> None:
+        """Append messages: arrays of topic ids and receive times, and a list of byte strings."""
+        self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)',
+                                    zip(topic_ids.tolist(), received_ns.tolist(), messages, strict=True))
+
+    def close(self, metadata_version: int, metadata: str) -> None:
+        """Add the index by time and the metadata, and close."""
+        self.connection.execute('CREATE INDEX timestamp_idx ON messages (timestamp ASC)')
+        self.connection.execute('INSERT INTO metadata (metadata_version, metadata) VALUES (?, ?)', (metadata_version, metadata))
+        self.connection.execute('COMMIT')
+        self.connection.close()
+
+    def abort(self) -> None:
+        """Close without finishing."""
+        self.connection.close()

@@ -1,9 +1,11 @@
 """Common part of the readers of storage files: from stretches of rows to messages by topic."""
 
-from collections.abc import Callable, Iterator, Sequence
+import queue
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -108,3 +110,54 @@ class StorageFile:
     def _lose(self, what, count):
         reason = f'{what} of {self.path.name}'
         self.lost[reason] = self.lost.get(reason, 0) + count
+
+
+T = TypeVar('T')
+
+DEPTH = 2
+"""Pieces that wait at most; bounds the memory."""
+
+_END = object()
+
+
+def read_ahead(pieces: Generator[T, None, None]) -> Generator[T, None, None]:
+    """
+    Run a generator in a thread and yield its items in order; its exceptions are raised here.
+
+    The thread ends with the generator, or soon after the consumer has closed this one.
+    """
+    waiting: queue.Queue[Any] = queue.Queue(DEPTH)
+    stop = threading.Event()
+
+    def put(item):
+        while not stop.is_set():
+            try:
+                return waiting.put(item, timeout=0.2)
+            except queue.Full:
+                continue
+
+    def run():
+        try:
+            for piece in pieces:
+                put((piece, None))
+                if stop.is_set():
+                    break
+            put((_END, None))
+        except BaseException as error:   # handed over to the consumer
+            put((_END, error))
+        finally:
+            pieces.close()
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        while True:
+            piece, error = waiting.get()
+            if error is not None:
+                raise error
+            if piece is _END:
+                return
+            yield piece
+    finally:
+        stop.set()
+        thread.join()

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from imu_calibration.by_hand.imu_pair import clipped
 from imu_calibration.by_hand.relative_arm import estimate_arm
 from imu_calibration.by_hand.workflow import calibrate_without_table
-from imu_calibration.calibration.document_parts import calibration_from_text, calibration_to_text
+from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
 from imu_calibration.compensation.compensate import Transfer, compensate
 from imu_calibration.nodes.processes import NodeProcesses, local_environment
 from msg_adapters.bag import open_recording
@@ -121,7 +121,7 @@ def _exchange(rclpy, context, case, speed):
     from rclpy.executors import SingleThreadedExecutor
     from sensor_msgs.msg import Imu
 
-    from imu_calibration.nodes.qos import input_qos, output_qos
+    from imu_calibration.nodes.inputs import input_qos, output_qos
     node = rclpy.create_node('validation', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)

@@ -14,9 +14,9 @@ from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.errors import NotObservableError
+from imu_calibration.selection.evidence import agree
 from imu_calibration.selection.explained_share import SIGNIFICANT_REST, pruned
 from imu_calibration.selection.gain import Gain, reduction_interval
-from imu_calibration.selection.halves import agree
 from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
 from imu_calibration.selection.search import Named, Search
 

@@ -17,10 +17,8 @@ from imu_calibration.by_hand.status import NOTHING, hand_status, look_for_poses
 from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand
 from imu_calibration.calibration.coverage import Coverage
 from imu_calibration.calibration.effect_states import GroupState, group_states, waiting_groups
-from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.pacing import SolvePacer
-from imu_calibration.calibration.session import SessionStatus
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SessionStatus, SolvePacer
 from imu_calibration.constants import STANDARD_GRAVITY
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.errors import InputError, NotObservableError

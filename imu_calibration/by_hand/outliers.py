@@ -9,7 +9,7 @@ from imu_calibration.by_hand.equations import COMPONENTS, Poses, State, TurnData
 from imu_calibration.by_hand.full_scale import missed_angle
 from imu_calibration.by_hand.model import HandModel
 from imu_calibration.by_hand.solver import HandSolution
-from imu_calibration.estimation.f_test import chance_of_fall
+from imu_calibration.chances import chance_of_fall
 
 P_VALUE = 1e-3
 """False positive rate for a recording without outliers, per kind."""

@@ -25,8 +25,7 @@ from imu_calibration.chances import chi2_sf
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import BARE, SensorModel
 from imu_calibration.estimation.prior import make_prior
-from imu_calibration.estimation.shrinkage import SURE
-from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.solution import SURE, Solution
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.evidence import LEAST_WINDOWS

@@ -21,8 +21,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError
 from imu_calibration.estimation.accumulator import restrict
-from imu_calibration.estimation.shrinkage import shrunk
-from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.solution import Solution, shrunk
 from imu_calibration.estimation.solver import solve
 from imu_calibration.preflight.joint_checks import check_units
 from imu_calibration.progress import report

@@ -8,7 +8,7 @@ import numpy as np
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.decision import decisions_text
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult, exit_code
 from imu_calibration.calibration.status import HELD

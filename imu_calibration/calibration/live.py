@@ -7,16 +7,15 @@ import numpy as np
 
 from imu_calibration.calibration import accumulator_state
 from imu_calibration.calibration.calibrate import conclude
+from imu_calibration.calibration.collector import LiveCollector, columns_at, copied
 from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, table_coverage
 from imu_calibration.calibration.effect_states import GroupState, group_states, waiting_groups
 from imu_calibration.calibration.gathered import Gathered, merge
 from imu_calibration.calibration.linearisation import linearise_again
-from imu_calibration.calibration.live_collector import LiveCollector, columns_at, copied
-from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.live_snapshot import LiveSnapshot
 from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
-from imu_calibration.calibration.session import SessionStatus, TableSession
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SessionStatus, TableSession
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficients

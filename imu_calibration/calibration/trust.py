@@ -1,8 +1,11 @@
 """Applied parts of a calibration: the decision per sensor, and consent of the user."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import numpy as np
+
+from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.calibration.decision import HARMS, HELPS, UNPROVEN, decisions_text, reason_of
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.nominal import with_nominal
@@ -116,3 +119,18 @@ def missing(calibration: Calibration) -> str:
 def standing(calibration: Calibration) -> str:
     """Return the decisions in short, for one line in a log."""
     return decisions_text(calibration.decisions)
+
+
+def with_measured_noise(calibration: Calibration, figures: NoiseFigures) -> Calibration:
+    """
+    Return the calibration with the white noise of noise.yaml in its statistics.
+
+    `noise_density` (per root hertz, by axis) gives the standard deviation of a sample at any rate; `noise_sd` is that at the rate at
+    which the noise was recorded. Compensation and its covariances read both through `Calibration.noise`.
+    """
+    statistics = dict(calibration.statistics)
+    for sensor in SENSORS:
+        density = np.array([axis.white for axis in figures.sensor(sensor)])
+        statistics[sensor] = dict(statistics.get(sensor, {})) | {
+            'noise_sd': (density * np.sqrt(figures.rate)).tolist(), 'noise_density': density.tolist()}
+    return replace(calibration, statistics=statistics)

@@ -3,8 +3,7 @@
 from argparse import Namespace
 
 from imu_calibration.cli import arguments
-from imu_calibration.cli.hints import hints_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, VerbResult, hints_of
 
 EXAMPLES = ('session --table table.yaml --output result', 'by_hand_session --gravity 9.81 --output result')
 
@@ -28,7 +27,7 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Namespace) -> VerbResult:
     """Calibrate into a folder that can be written, print the verdict, return the exit code."""
     from imu_calibration import files
-    from imu_calibration.calibration.document_parts import to_mapping
+    from imu_calibration.calibration.document_text import to_mapping
     from imu_calibration.cli.show import show_calibration, warn
     from imu_calibration.use_cases.calibrate import calibrate
     arguments.require_place(options, 'calibrate', options.bags)

@@ -4,8 +4,7 @@ from argparse import Namespace
 from dataclasses import asdict
 
 from imu_calibration.cli.arguments import BAG, add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
-from imu_calibration.cli.hints import hints_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, VerbResult, hints_of
 from imu_calibration.errors import ImuCalibrationError, with_hint
 
 EXAMPLES = ('session', 'session --table table.yaml')

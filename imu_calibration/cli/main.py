@@ -2,11 +2,14 @@
 
 import contextlib
 import io
+import json
+import math
 import os
 import signal
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 """The matrices are narrow: several BLAS threads cost more than they save, above all next to other programs."""
@@ -27,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: Namespace) -> int:
     """Run the verb that was parsed and print its document if --json is given; return the exit code."""
-    from imu_calibration.cli.hints import hints_of
+    from imu_calibration.cli.parser import hints_of
     from imu_calibration.errors import ImuCalibrationError, printable
     from imu_calibration.progress import listening
     prog = f'imu_calibration {options.verb}'
@@ -52,7 +55,6 @@ def run(options: Namespace) -> int:
     except KeyboardInterrupt:
         return _interrupted(prog)
     if options.json:
-        from imu_calibration.cli.json_document import json_text
         print(json_text(options.verb, code, document))
     return code
 
@@ -60,3 +62,25 @@ def run(options: Namespace) -> int:
 def _interrupted(prog):
     print(f'{prog}: interrupted; no file was written', file=sys.stderr)
     return 130
+
+
+FORMAT = 'imu_calibration/cli/1'
+
+
+def json_text(verb: str, exit_code: int, document: Mapping[str, Any]) -> str:
+    """Return one JSON document: format, verb, exit code, and the result or the error; numbers that are not finite become null."""
+    part = 'error' if 'error' in document else 'result'
+    return json.dumps({'format': FORMAT, 'verb': verb, 'exit_code': exit_code, part: _plain(document)}, allow_nan=False)
+
+
+def _plain(value):
+    """Return a value as JSON types: mappings, lists, text, numbers, null."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set)):
+        return [_plain(item) for item in value]
+    if hasattr(value, 'tolist'):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, (str, bool, int)) else str(value)

@@ -2,12 +2,13 @@
 
 import argparse
 import sys
+from argparse import Namespace
 from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, NamedTuple, NoReturn
 
 import imu_calibration
-from imu_calibration.errors import did_you_mean
+from imu_calibration.errors import KEYS, did_you_mean
 
 VERBS = {
     'inspect': 'Topics, rates, gaps, stamps, suspicious units and axes, motions found, and the parameters that the recording determines.',
@@ -101,3 +102,8 @@ def _usage(action):
     """Return a required argument as the usage line shows it."""
     name = action.metavar or action.dest.upper()
     return f'{action.option_strings[0]} {name}' if action.option_strings else f'{name} [{name} ...]' if action.nargs == '+' else name
+
+
+def hints_of(options: Namespace) -> dict[str, str]:
+    """Return {key of an error: option}, of the options that this verb has."""
+    return {key: '--' + key.replace('_', '-') for key in KEYS if key in vars(options)}

@@ -7,9 +7,8 @@ import numpy as np
 
 from imu_calibration.beyond.inquiry import Examination, inquire
 from imu_calibration.beyond.look import look_beyond
-from imu_calibration.diagnosis.findings import finding
 from imu_calibration.diagnosis.result import Diagnosis, Finding, parameters_of
-from imu_calibration.diagnosis.sentences import candidates_of, sentence
+from imu_calibration.diagnosis.sentences import candidates_of, finding, sentence
 from imu_calibration.diagnosis.separating_motion import motions_of_one_joint, separating_motion
 from imu_calibration.diagnosis.traces import residual_traces
 from imu_calibration.effects.base import SENSORS, Role

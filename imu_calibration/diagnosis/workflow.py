@@ -15,10 +15,9 @@ from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.verdict_notes import unsteady
-from imu_calibration.diagnosis.by_hand.diagnose import told_by_hand
 from imu_calibration.diagnosis.diagnose import told
-from imu_calibration.diagnosis.document import to_mapping
-from imu_calibration.diagnosis.result import Diagnosis, formula_gain
+from imu_calibration.diagnosis.hand_diagnosis import told_by_hand
+from imu_calibration.diagnosis.result import Diagnosis, formula_gain, to_mapping
 from imu_calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST
 from imu_calibration.diagnosis.traces import residual_traces
 from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
@@ -144,7 +143,7 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
                            *,
                            progress: Callable | None = None) -> DiagnosisResult:
     """
-    Calibrate a recording by hand, identify the errors of the model and their causes, and extend it (see `diagnosis.by_hand`).
+    Calibrate a recording by hand, identify the errors of the model and their causes, and extend it (see `diagnosis.hand_diagnosis`).
 
     Parameters
     ----------

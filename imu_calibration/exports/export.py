@@ -12,7 +12,7 @@ import imu_calibration
 from imu_calibration.allan.figures import Densities, NoiseFigures
 from imu_calibration.allan.summary import BASIS
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import to_mapping
+from imu_calibration.calibration.document_text import to_mapping
 from imu_calibration.calibration.trust import Usable, caveats, usable
 from imu_calibration.effects.base import SENSORS, UNIT, Role
 from imu_calibration.errors import InputError, did_you_mean

@@ -8,7 +8,7 @@ import imu_calibration
 from imu_calibration.calibration.decision import UNPROVEN
 from imu_calibration.calibration.document import UNKNOWN, Calibration
 from imu_calibration.calibration.document_checks import check_numbers
-from imu_calibration.calibration.document_parts import from_mapping
+from imu_calibration.calibration.document_text import from_mapping
 from imu_calibration.calibration.status import HELD, WEAK
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import SensorModel

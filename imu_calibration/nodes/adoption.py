@@ -6,8 +6,8 @@ from imu_calibration import files
 from imu_calibration.calibration import trust
 from imu_calibration.calibration.comparison import moved_beyond_sd
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_from_text
-from imu_calibration.calibration.measured_noise import with_measured_noise
+from imu_calibration.calibration.document_text import calibration_from_text
+from imu_calibration.calibration.trust import with_measured_noise
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.health import CalibrationHealth, HealthOptions, StopWatch
 from imu_calibration.compensation.stream import requested_transfer

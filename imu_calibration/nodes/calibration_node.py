@@ -20,9 +20,8 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from imu_calibration import files
-from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.session import LiveSession
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSession, LiveSettings
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.nodes.calibration_guide import CalibrationGuide
@@ -32,15 +31,11 @@ from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import markers_of
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
 from imu_calibration.nodes.heap import give_arrays_own_pages
-from imu_calibration.nodes.hints import HINTS
-from imu_calibration.nodes.inputs import BatchInput, watch_inputs
-from imu_calibration.nodes.lifecycle import run_node
-from imu_calibration.nodes.parameters import declare_parameters
-from imu_calibration.nodes.qos import latched_qos, output_qos
+from imu_calibration.nodes.inputs import BatchInput, latched_qos, output_qos, watch_inputs
+from imu_calibration.nodes.lifecycle import announce, run_node
+from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of, words_of
-from imu_calibration.nodes.session_files import SessionFiles
-from imu_calibration.nodes.session_reference import reference_of
-from imu_calibration.nodes.topics import announce
+from imu_calibration.nodes.session_files import SessionFiles, reference_of
 from imu_calibration.nodes.worker_requests import Listeners
 from imu_calibration.resources import config_file
 from imu_calibration.segmentation.window import WindowSettings

@@ -11,11 +11,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from imu_calibration.calibration.coverage import bars_of
-from imu_calibration.calibration.document_parts import calibration_to_text
-from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
-from imu_calibration.calibration.pacing import SolvePacer
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.calibration.result import CalibrationResult, summary
-from imu_calibration.calibration.session import LiveSession
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSession, LiveSettings, SolvePacer
 from imu_calibration.calibration.trust import missing
 from imu_calibration.diagnosis.live import DiagnosisState, question_about
 from imu_calibration.errors import ImuCalibrationError, NotObservableError, shortened

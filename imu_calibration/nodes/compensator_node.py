@@ -26,16 +26,11 @@ from imu_calibration.nodes.adoption import Adopted, Awaited, adopt, again, has_m
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
 from imu_calibration.nodes.complaints import ERROR, Complaints
-from imu_calibration.nodes.guarded import guarded
-from imu_calibration.nodes.hints import HINTS
-from imu_calibration.nodes.inputs import MatchedInput, sent_ns, watch_inputs
-from imu_calibration.nodes.lifecycle import run_node
+from imu_calibration.nodes.inputs import MatchedInput, latched_qos, output_qos, sent_ns, watch_inputs
+from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node
 from imu_calibration.nodes.message_compensation import LiveCompensation
-from imu_calibration.nodes.parameters import declare_parameters
-from imu_calibration.nodes.qos import latched_qos, output_qos
+from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.static_frames import StaticFrames
-from imu_calibration.nodes.timers import every
-from imu_calibration.nodes.topics import announce
 
 LOOK_FOR_FILE = 1.0
 """Seconds between two attempts to find a calibration file that is waited for."""

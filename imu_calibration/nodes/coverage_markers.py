@@ -6,8 +6,7 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from imu_calibration.calibration.coverage import Coverage
-from imu_calibration.calibration.coverage_look import ARMS_TIMES, ARROW, DONE, NOW, RADIUS, SEEN, TINY, WHITE, cells_of, line_of
+from imu_calibration.calibration.coverage import ARMS_TIMES, ARROW, DONE, NOW, RADIUS, SEEN, TINY, WHITE, Coverage, cells_of, line_of
 
 
 def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:

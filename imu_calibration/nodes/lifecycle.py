@@ -1,20 +1,47 @@
-"""From start to end of a node's process: exit code 0 after SIGINT and SIGTERM, one line and 1 when it cannot run or continue."""
+"""From start to end of a node's process: help, first line, callbacks and timers; exit code 0 after SIGINT and SIGTERM, 1 with one line."""
 
+import inspect
 import signal
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from imu_calibration.errors import ImuCalibrationError, shortened
-from imu_calibration.nodes.help import help_text
+from imu_calibration.nodes.parameter_files import meaning, settings_of, value_text
 from imu_calibration.nodes.parameters import unknown_parameters
-from imu_calibration.nodes.timers import every
+from imu_calibration.settings import describe
+
+WIDTH = 118
+
+
+def help_text(node_class: Callable[[], Any]) -> str:
+    """Return the help of a node, from the docstring of its module and the settings that it declares."""
+    module = sys.modules[node_class.__module__]
+    name = Path(inspect.getfile(module)).stem
+    lines = [f'usage: ros2 run imu_calibration {name} --ros-args [-p NAME:=VALUE ...] [-r FROM:=TO ...] [--params-file FILE]', '',
+             inspect.getdoc(module) or '', '', 'parameters:']
+    for group in settings_of(name):
+        for item in describe(group):
+            lines.append(f'  {item.name}: {value_text(item.default)}')
+            lines += textwrap.wrap(meaning(item), WIDTH, initial_indent='      ', subsequent_indent='      ')
+    return '\n'.join(lines)
+
+
+def every(node: Node, seconds: float, callback: Callable[[], Any]) -> Any:
+    """Call a function of a node every so many seconds of the steady clock; return the timer."""
+    return node.create_timer(seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 HEARD = 0.1
@@ -119,3 +146,19 @@ def _end(node: Any) -> None:
 def _ignore_signals() -> None:
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
+
+
+def guarded(callback: Callable[..., Any], failed: Callable[[Exception], Any]) -> Callable[..., None]:
+    """Return `callback` with its exceptions passed to `failed`."""
+    def call(*arguments: Any) -> None:
+        try:
+            callback(*arguments)
+        except Exception as error:
+            failed(error)
+    return call
+
+
+def announce(node: Node, inputs: Sequence[str], outputs: Sequence[str], *, note: str = '') -> None:
+    """Log the full names of topics, given as relative names, and a note."""
+    read, published = (', '.join(map(node.resolve_topic_name, names)) or 'nothing' for names in (inputs, outputs))
+    node.get_logger().info(f'reads {read}; publishes {published}' + (f'; {note}' if note else ''))

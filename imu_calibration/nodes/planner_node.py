@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -25,7 +26,7 @@ from visualization_msgs.msg import MarkerArray
 
 from imu_calibration import files
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_from_text
+from imu_calibration.calibration.document_text import calibration_from_text
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.driving.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect, separator_of
 from imu_calibration.driving.driver import Driver, DriverSettings
@@ -33,28 +34,59 @@ from imu_calibration.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import driven_markers
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
-from imu_calibration.nodes.guarded import guarded
-from imu_calibration.nodes.hints import HINTS
-from imu_calibration.nodes.inputs import BatchInput, MatchedInput, watch_inputs
-from imu_calibration.nodes.joint_commands import make_command
-from imu_calibration.nodes.lifecycle import run_node
-from imu_calibration.nodes.other_drivers import OtherDrivers
-from imu_calibration.nodes.parameters import declare_parameters
-from imu_calibration.nodes.planner_settings import PlannerNodeSettings, restricted_limits
+from imu_calibration.nodes.inputs import BatchInput, MatchedInput, latched_qos, watch_inputs
+from imu_calibration.nodes.joint_commands import OtherDrivers, make_command
+from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node
+from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.planner_status import drive_statuses
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
-from imu_calibration.nodes.qos import latched_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
-from imu_calibration.nodes.timers import every
-from imu_calibration.nodes.topics import announce
 from imu_calibration.planning.planner import make_planner
 from imu_calibration.planning.repertoire import up_at
 from imu_calibration.planning.situation import expected_noise, require_grade
-from imu_calibration.reference.motion_limits import NOT_CHECKED, limit_words, limits_of, missing_ranges, range_warnings
+from imu_calibration.reference.motion_limits import NOT_CHECKED, MotionLimits, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from imu_calibration.resources import config_file
+from imu_calibration.settings import setting
+from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.joint_state import joint_row
 from msg_adapters.stamps import UnusableMessage
+
+
+@dataclass(frozen=True)
+class PlannerNodeSettings:
+    """Moved joints, parameters to determine, and interface of the commands."""
+
+    table_file: str = setting('', '', 'description of the table with the limits of its joints, path; empty: urdf_file describes the arm',
+                              symptom='other joints, or limits that are not theirs', session=True, path=True)
+    tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
+                                   symptom='motions last too long, or end too early', session=True, path=True)
+    accelerometer_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that are not estimated')
+    gyroscope_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that are not estimated')
+    reference_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that are not estimated')
+    grade: str = setting('industrial', '', 'grade of the noise that is expected before it is known: ' + ', '.join(sorted(GRADES)),
+                         symptom='the predicted standard deviations are not reached')
+    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise, path; empty: that of the grade',
+                              symptom='the predicted standard deviations are not reached', session=True, path=True)
+    imu_rate: float = setting(100.0, 'Hz', 'Imu messages per second', (1.0, 20000.0),
+                              'the predicted standard deviations are not reached')
+    command: str = setting('topic', '', 'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory, needs '
+                           'control_msgs) or auto (the action where there is one)', symptom='nothing moves')
+    max_turns: float = setting(1.0, '1', 'turns of an endless joint to either side of its position at the first start, unwound at the end; '
+                               '0: unlimited, for slip rings', (0.0, 1e4), 'too large: cables are wound up; too small: slow plans',
+                               fixed='the range of every joint is set at the first start')
+    reach_deg: float = setting(0.0, 'deg', 'largest angle of each joint to either side of its position at the first start; '
+                               'sliding joints do not move; 0: the whole range', (0.0, 3600.0), 'too large: collisions',
+                               fixed='the range of every joint is set at the first start')
+    calibration_node: str = setting('calibration_node', '', 'name of the node that collects the windows',
+                                    symptom='~/start reports a missing service')
+
+
+def restricted_limits(limits: MotionLimits, position: np.ndarray, settings: PlannerNodeSettings) -> MotionLimits:
+    """Return the limits of the joints restricted by `max_turns` and `reach_deg` about a position."""
+    limits = limits.wound(position, settings.max_turns)
+    return limits.reached(position, settings.reach_deg) if settings.reach_deg else limits
+
 
 PERIOD = 0.1
 """Seconds between two checks of the clock."""

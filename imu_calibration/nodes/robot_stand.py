@@ -15,7 +15,7 @@ from std_msgs.msg import String
 from imu_calibration import files
 from imu_calibration.errors import InputError
 from imu_calibration.nodes.complaints import WARNING, say
-from imu_calibration.nodes.qos import latched_qos
+from imu_calibration.nodes.inputs import latched_qos
 from imu_calibration.nodes.static_frames import StaticFrames
 from imu_calibration.reference.table import Table
 from imu_calibration.reference.urdf import root_of, table_from_urdf

@@ -22,18 +22,16 @@ from trajectory_msgs.msg import JointTrajectory
 from imu_calibration import files
 from imu_calibration.calibration.decision import BY_DEFINITION
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.errors import ImuCalibrationError, InputError
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
-from imu_calibration.nodes.hints import HINTS
-from imu_calibration.nodes.lifecycle import run_node
-from imu_calibration.nodes.parameters import declare_parameters
+from imu_calibration.nodes.inputs import latched_qos, output_qos
+from imu_calibration.nodes.lifecycle import announce, run_node
+from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
-from imu_calibration.nodes.qos import latched_qos, output_qos
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
-from imu_calibration.nodes.topics import announce
 from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.reference.table import Table
 from imu_calibration.resources import config_file

@@ -13,8 +13,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
-from imu_calibration.selection.evidence import WindowEvidence, folds_of
-from imu_calibration.selection.halves import agree
+from imu_calibration.selection.evidence import WindowEvidence, agree, folds_of
 from imu_calibration.selection.noise_beside_effects import first_noise, noise_beside_effects
 from imu_calibration.selection.normal_matrices import normal_matrix
 from imu_calibration.selection.parameter_space import ParameterSpace, counted_from_values, parameter_space, questions, smooth_parameters

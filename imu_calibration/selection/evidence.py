@@ -11,7 +11,7 @@ from imu_calibration.chances import chi2_sf, f_sf
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, solve_normal, solve_scaled
-from imu_calibration.estimation.shrinkage import SURE
+from imu_calibration.estimation.solution import SURE
 from imu_calibration.selection.normal_matrices import white_means, within_of_axis
 from imu_calibration.selection.parameter_space import ParameterSpace
 from imu_calibration.selection.recent import Recent
@@ -248,3 +248,36 @@ class WindowEvidence(Evidence):
 def _squares(parts, rows):
     """Return residual sums of squares from normal matrices of folds, shape (p, f, n, n), and residual vectors (f, n), shape (p,)."""
     return np.einsum('fi,pfij,fj->p', rows, parts, rows)
+
+
+DISAGREE = 1e-4
+"""Significance level of the test that the halves differ."""
+APART = 1 / 16
+"""
+Share of an effect's chi-square that is lost with one value for both halves, above which they disagree.
+
+For halves of equal precision: values that differ by half of the joint estimate.
+"""
+
+
+def agree(halves: Sequence[tuple[np.ndarray, np.ndarray]], whole: tuple[np.ndarray, np.ndarray], at: Sequence[int]) -> bool:
+    """
+    Return whether the estimates of some parameters from two halves agree within their precision.
+
+    They disagree when the difference is significant and one value for both loses more than `APART` of the chi-square.
+    A half that hardly determines an effect loses little, for any value: before any rotation, an arm may be estimated at a metre.
+
+    Parameters
+    ----------
+    halves, whole
+        (values, covariance) of the same parameters, fitted to each half and to both.
+    at : sequence of int
+        Indices of the parameters under test.
+
+    """
+    at = list(at)
+    difference = (halves[0][0] - halves[1][0])[at]
+    apart = float(difference @ np.linalg.solve((halves[0][1] + halves[1][1])[np.ix_(at, at)], difference))
+    value = whole[0][at]
+    explained = float(value @ np.linalg.solve(whole[1][np.ix_(at, at)], value))
+    return bool(chi2_sf(apart, len(at)) > DISAGREE or apart < APART * explained)

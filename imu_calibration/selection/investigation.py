@@ -12,17 +12,14 @@ from imu_calibration.errors import NotObservableError
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.clipping import windows_at, without_clipping
 from imu_calibration.selection.evidence import LEAST_WINDOWS
 from imu_calibration.selection.explained_share import Explained, pruned, sensors_of
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.lag_explanations import lag_explanations
-from imu_calibration.selection.pairs import best_pairs
 from imu_calibration.selection.questions import Question, testable_effects, without_saturation
-from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
-from imu_calibration.selection.saturation import Saturation
+from imu_calibration.selection.rivals import Rival, best_pairs, same_questions, settle_rivals, simpler
+from imu_calibration.selection.saturation import Saturation, windows_at, without_clipping
 from imu_calibration.selection.search import Named, Search
-from imu_calibration.selection.simpler import simpler
 
 LINEARISATIONS = 5
 """Largest number of linearisations."""

@@ -13,7 +13,7 @@ from imu_calibration.by_hand.workflow import calibrate_without_table
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.check import check_on_table
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.calibration.result import CalibrationResult, exit_code, summary
 from imu_calibration.calibration.statements import Verdict
 from imu_calibration.calibration.verdict import judged

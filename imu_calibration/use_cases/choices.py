@@ -6,7 +6,7 @@ from typing import Any, TypedDict
 
 from imu_calibration import files
 from imu_calibration.allan.figures import NoiseFigures
-from imu_calibration.calibration.document_parts import checked_tolerances
+from imu_calibration.calibration.document_text import checked_tolerances
 from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.errors import InputError

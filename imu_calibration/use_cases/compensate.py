@@ -8,8 +8,7 @@ from pathlib import Path
 from imu_calibration import files
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.measured_noise import with_measured_noise
-from imu_calibration.calibration.trust import caveats, usable
+from imu_calibration.calibration.trust import caveats, usable, with_measured_noise
 from imu_calibration.compensation.stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
 from imu_calibration.errors import InputError
 from imu_calibration.progress import counter

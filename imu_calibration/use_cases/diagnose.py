@@ -8,7 +8,7 @@ from typing import Unpack
 
 from imu_calibration import files
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.diagnosis.workflow import DiagnosisResult, diagnose_recording, diagnose_without_table
 from imu_calibration.progress import counter, report

@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration import files
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.compensation.evaluation import session_truth
 from imu_calibration.exports.export import Export, export, find_reader, find_target
 from imu_calibration.exports.imported import import_file

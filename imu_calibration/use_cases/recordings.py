@@ -13,7 +13,7 @@ from imu_calibration.errors import InputError
 from imu_calibration.progress import counter
 from imu_calibration.samples import SampleBlock, TemperatureSamples
 from msg_adapters.bag import Recording, open_recording
-from msg_adapters.read_ahead import read_ahead
+from msg_adapters.storage import read_ahead
 
 Source = Callable[[], Iterator[SampleBlock]]
 """Yields the blocks of a recording; can be called repeatedly."""

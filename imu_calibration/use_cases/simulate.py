@@ -12,7 +12,7 @@ import numpy as np
 from imu_calibration import documents, files
 from imu_calibration.calibration.decision import BY_DEFINITION
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import Catalogue

@@ -20,9 +20,8 @@ from imu_calibration.errors import InputError
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.choices import Choices
-from imu_calibration.use_cases.foxglove_file import foxglove_bytes
+from imu_calibration.use_cases.foxglove_file import PARAMETERS, RESIDUAL, SPECTRUM, foxglove_bytes, parameters, residual, spectrum
 from imu_calibration.use_cases.stand import Stand
-from imu_calibration.use_cases.view_messages import PARAMETERS, RESIDUAL, SPECTRUM, parameters, residual, spectrum
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +31,7 @@ class View:
     calibration: Calibration
     """The calibration."""
     contents: dict[str, dict[str, Any]]
-    """Topic -> content, as in `view_messages.SCHEMAS`."""
+    """Topic -> content, as in `foxglove_file.SCHEMAS`."""
     coverage: Coverage | None
     """The sphere; None where only a file is known."""
     seconds: float = 0.0

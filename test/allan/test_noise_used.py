@@ -18,8 +18,8 @@ from imu_calibration.allan.summary import position_budget
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, Term
 from imu_calibration.by_hand.live import LiveByHand
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
-from imu_calibration.calibration.measured_noise import with_measured_noise
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.trust import with_measured_noise
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import CompensationStream

@@ -9,7 +9,7 @@ import imu_calibration as imu
 from imu_calibration.by_hand.calibrate import gather_by_hand
 from imu_calibration.by_hand.check import prove_readings
 from imu_calibration.by_hand.workflow import read_by_hand
-from imu_calibration.calibration.document_parts import calibration_from_text, calibration_to_text
+from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
 from imu_calibration.calibration.proof import nominal_values
 from imu_calibration.calibration.trust import caveats
 from imu_calibration.calibration.uncorrected import END, MEAN

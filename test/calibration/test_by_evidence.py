@@ -10,10 +10,10 @@ import pytest
 import imu_calibration as imu
 from imu_calibration.beyond.inquiry import Examination
 from imu_calibration.beyond.unexplained import Unexplained, biases_off
-from imu_calibration.calibration import by_evidence, spread_windows
+from imu_calibration.calibration import by_evidence, gathered
 from imu_calibration.calibration.by_evidence import _moves, stands_out
+from imu_calibration.calibration.gathered import SpreadWindows
 from imu_calibration.calibration.model_changes import Demand
-from imu_calibration.calibration.spread_windows import SpreadWindows
 from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.workflow import diagnose_recording
 from imu_calibration.effects.forward_equations import predict
@@ -109,7 +109,7 @@ def test_windows_for_the_search_are_spread_and_bounded(monkeypatch):
     for window in windows:
         every.add(window)
     assert [w.time[0] for w in every.windows] == [w.time[0] for w in windows]
-    monkeypatch.setattr(spread_windows, 'MOST_SAMPLES', 4000)
+    monkeypatch.setattr(gathered, 'MOST_SAMPLES', 4000)
     some = SpreadWindows()
     for window in windows:
         some.add(window)

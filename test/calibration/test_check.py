@@ -6,7 +6,7 @@ import pytest
 from refusal import refused
 
 from imu_calibration.calibration.check import CheckResult, check_on_table
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.cli.main import main
 from imu_calibration.documents import to_text
 from imu_calibration.errors import InputError

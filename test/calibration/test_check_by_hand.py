@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.cli.main import main
 from imu_calibration.samples import SampleBlock, TemperatureSamples
 from imu_calibration.use_cases.calibrate import calibrate

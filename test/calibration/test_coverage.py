@@ -12,10 +12,9 @@ from imu_calibration.by_hand.live import LiveByHand
 from imu_calibration.by_hand.next_pose import hand_coverage, knowledge_of
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.by_hand.status import NOTHING
-from imu_calibration.calibration.coverage import DIRECTIONS, ENOUGH, Bar, Coverage, Step, table_coverage
-from imu_calibration.calibration.coverage_look import line_of
-from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
+from imu_calibration.calibration.coverage import DIRECTIONS, ENOUGH, Bar, Coverage, Step, line_of, table_coverage
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.errors import NotObservableError
 from imu_calibration.estimation.standard_motions import MOTIONS, motions_about
 from imu_calibration.samples import SampleBlock

@@ -11,9 +11,9 @@ from refusal import refused
 from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
 from imu_calibration.by_hand.inquiry import Inquiry, investigate_by_hand
 from imu_calibration.by_hand.options import HandOptions
-from imu_calibration.diagnosis.by_hand import where
-from imu_calibration.diagnosis.by_hand.diagnose import diagnose_by_hand
-from imu_calibration.diagnosis.document import to_mapping
+from imu_calibration.diagnosis import hand_diagnosis
+from imu_calibration.diagnosis.hand_diagnosis import diagnose_by_hand
+from imu_calibration.diagnosis.result import to_mapping
 from imu_calibration.diagnosis.workflow import diagnosis_lines
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
@@ -100,7 +100,7 @@ def test_what_held_parameters_may_be_is_no_finding(monkeypatch):
 
 def test_a_place_among_few_poses_is_paid_for(monkeypatch):
     """Any range of noise is the likeliest of many: its chance counts them all."""
-    monkeypatch.setattr(where, 'MOST_OF_IT', 0.0)
+    monkeypatch.setattr(hand_diagnosis, 'MOST_OF_IT', 0.0)
     poses = SimpleNamespace(time=10.0 * np.arange(24), temperature_c=None)
     rng = np.random.default_rng(21501)
     told = []
@@ -108,7 +108,7 @@ def test_a_place_among_few_poses_is_paid_for(monkeypatch):
         up = rng.normal(size=(24, 3))
         hand = SimpleNamespace(gravity=GRAVITY, state=SimpleNamespace(up=up / np.linalg.norm(up, axis=1, keepdims=True)), poses=poses)
         block = SimpleNamespace(sensor='gyroscope', floor=np.ones((24, 3)), pose=np.arange(24), time=poses.time)
-        told += where.regimes_by_hand(hand, block, rng.normal(size=(24, 3)))
+        told += hand_diagnosis.regimes_by_hand(hand, block, rng.normal(size=(24, 3)))
     assert len(told) <= 1
 
 

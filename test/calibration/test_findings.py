@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.diagnosis import diagnose as on_a_table
-from imu_calibration.diagnosis.by_hand import diagnose as by_hand
-from imu_calibration.diagnosis.findings import finding
-from imu_calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST, candidates_of, sentence
+from imu_calibration.diagnosis import hand_diagnosis as by_hand
+from imu_calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST, candidates_of, finding, sentence
 from imu_calibration.diagnosis.separating_motion import motions_of_one_joint
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel

@@ -10,9 +10,8 @@ from imu_calibration.calibration import accumulator_state
 from imu_calibration.calibration.calibrate import calibrate, conclude, solve_gathered
 from imu_calibration.calibration.decision import HELPS
 from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.calibration.live_settings import LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.pacing import SolvePacer
+from imu_calibration.calibration.session import LiveSettings, SolvePacer
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.preflight.stream_watch import StreamWatch

@@ -9,9 +9,9 @@ from test_live_calibration import assert_same, blocks
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.calibration.live_settings import LiveSettings
 from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.session import LiveSettings
 from imu_calibration.diagnosis.diagnose import told
 from imu_calibration.diagnosis.live import Answer, DiagnosisState, describe, question_about
 from imu_calibration.diagnosis.workflow import diagnose_recording

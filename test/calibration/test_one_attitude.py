@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.decision import UNPROVEN, decide, reason_of
-from imu_calibration.calibration.document_parts import calibration_from_text, calibration_to_text
+from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
 from imu_calibration.calibration.status import HELD
 from imu_calibration.effects.base import Role
 from imu_calibration.reference.table import Table

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_adapters_copy import raw_messages
 
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.effects.forward_equations import sensor_output

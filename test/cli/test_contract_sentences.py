@@ -7,7 +7,7 @@ import pytest
 from imu_calibration.calibration import trust
 from imu_calibration.calibration.check import CheckResult
 from imu_calibration.calibration.decision import NO_PROOF, reason_of
-from imu_calibration.calibration.document_parts import calibration_from_text
+from imu_calibration.calibration.document_text import calibration_from_text
 from imu_calibration.errors import InputError, with_hint
 from imu_calibration.exports.export import find_target, loss_lines
 from imu_calibration.exports.loss import Loss

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from imu_calibration.calibration.document_parts import calibration_from_text
+from imu_calibration.calibration.document_text import calibration_from_text
 from imu_calibration.cli.main import main
 
 pytestmark = pytest.mark.slow

@@ -86,7 +86,7 @@ def test_quiet_prints_no_result(capsys):
 
 
 def test_numbers_that_are_not_finite_become_null():
-    from imu_calibration.cli.json_document import json_text
+    from imu_calibration.cli.main import json_text
     assert json.loads(json_text('x', 0, {'a': float('nan'), 'b': [float('inf'), 1.5]}))['result'] == {'a': None, 'b': [None, 1.5]}
 
 

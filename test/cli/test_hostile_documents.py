@@ -15,7 +15,7 @@ from refusal import refused as expected
 
 from imu_calibration.by_hand.sample_store import HandStore
 from imu_calibration.calibration.accumulator_state import saved_model
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.cli.fleet_run import csv_text, unit_rows
 from imu_calibration.documents import from_text
 from imu_calibration.errors import DocumentError, InputError

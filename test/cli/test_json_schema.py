@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.cli import parser, watch
-from imu_calibration.cli.json_document import json_text
-from imu_calibration.cli.main import main
-from imu_calibration.cli.watch_screen import NodeStatus
+from imu_calibration.cli.main import json_text, main
+from imu_calibration.cli.watch import NodeStatus
 
 ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
 SESSION, TABLE, TRUTH = (f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml'))

@@ -11,7 +11,7 @@ import time
 import pytest
 from rich.console import Console
 
-from imu_calibration.cli.watch_screen import BAR, NodeStatus, bar, ratio_of, screen
+from imu_calibration.cli.watch import BAR, NodeStatus, bar, ratio_of, screen
 
 STATUSES = {
     'streams': NodeStatus(0, 'Imu messages come', {}),

@@ -8,7 +8,7 @@ from refusal import refused
 
 from imu_calibration.calibration.comparison import LEVEL, compare
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.calibration.status import DETERMINED, HELD
 from imu_calibration.cli.main import main
 from imu_calibration.effects.sensor_model import SensorModel

@@ -12,7 +12,7 @@ from refusal import refused
 
 from imu_calibration import documents
 from imu_calibration.calibration import trust
-from imu_calibration.calibration.document_parts import calibration_to_text, checked_tolerances, from_mapping, to_mapping
+from imu_calibration.calibration.document_text import calibration_to_text, checked_tolerances, from_mapping, to_mapping
 from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.errors import InputError
 from imu_calibration.nodes.message_compensation import LiveCompensation
@@ -133,7 +133,7 @@ def test_no_damaged_field_gets_through(part):
 ATTACKS = '''
 import resource
 resource.setrlimit(resource.RLIMIT_AS, (2 * 10**9, 2 * 10**9))
-from imu_calibration.calibration.document_parts import calibration_from_text
+from imu_calibration.calibration.document_text import calibration_from_text
 from imu_calibration.errors import InputError
 laughs = "".join(f"a{k}: &a{k} [{', '.join(['*a' + str(k - 1)] * 10)}]\\n" for k in range(1, 12))
 texts = {

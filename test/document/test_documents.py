@@ -11,7 +11,7 @@ from refusal import refused
 
 from imu_calibration import documents
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_from_text, calibration_to_text, from_mapping, to_mapping
+from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text, from_mapping, to_mapping
 from imu_calibration.calibration.plausibility import implausible
 from imu_calibration.calibration.status import DETERMINED, HELD, WEAK, Status
 from imu_calibration.effects.catalogue import CATALOGUE

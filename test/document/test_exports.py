@@ -15,7 +15,7 @@ from scipy.io import loadmat
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures
 from imu_calibration.allan.terms import Term
 from imu_calibration.calibration.comparison import compare
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.compensate import compensate
 from imu_calibration.effects.base import SENSORS, Role

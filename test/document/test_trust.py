@@ -9,7 +9,7 @@ from refusal import refused
 from imu_calibration.calibration import decision, trust
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.decision import HARMS, HELPS, NO_PROOF, UNPROVEN, decide, most_cautious, reason_of
-from imu_calibration.calibration.document_parts import calibration_from_text, calibration_to_text, from_mapping, to_mapping
+from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text, from_mapping, to_mapping
 from imu_calibration.calibration.reasons import HAND_AXES
 from imu_calibration.calibration.status import HELD
 from imu_calibration.cli.main import main

@@ -10,7 +10,7 @@ from imu_calibration import files
 from imu_calibration.calibration import trust
 from imu_calibration.calibration.decision import HARMS as HARMFUL
 from imu_calibration.calibration.decision import HELPS, UNPROVEN
-from imu_calibration.calibration.document_parts import calibration_from_text, calibration_to_text
+from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
 from imu_calibration.calibration.nominal import with_nominal
 from imu_calibration.cli.main import main
 from imu_calibration.effects.base import SENSORS, Role

@@ -15,7 +15,7 @@ from refusal import refused
 
 import imu_calibration as imu
 from imu_calibration.calibration.accumulator_state import from_bytes, to_bytes
-from imu_calibration.calibration.document_parts import calibration_from_text, calibration_to_text
+from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
 from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.effects.base import Effect

@@ -9,7 +9,7 @@ from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel, parse_reference
 from imu_calibration.estimation.accumulator import Accumulator
-from imu_calibration.estimation.shrinkage import shrunk
+from imu_calibration.estimation.solution import shrunk
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.reference.table import Table

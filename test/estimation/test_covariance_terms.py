@@ -7,7 +7,7 @@ import pytest
 from refusal import refused
 
 import imu_calibration as imu
-from imu_calibration.calibration.document_parts import calibration_from_text, calibration_to_text, from_mapping, to_mapping
+from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text, from_mapping, to_mapping
 from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.status import REPLACEMENT
 from imu_calibration.compensation.compensate import invertible_values

@@ -19,7 +19,7 @@ from imu_calibration.allan.document import noise_from_text, noise_to_text
 from imu_calibration.allan.identify import figures_of, identify_noise
 from imu_calibration.by_hand.sample_store import HandStore
 from imu_calibration.calibration.accumulator_state import from_bytes, saved_demand, saved_model, to_bytes
-from imu_calibration.calibration.document_parts import calibration_from_text, calibration_to_text
+from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.documents import from_text

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.cli.fleet_units import is_bag
+from imu_calibration.cli.fleet_run import is_bag
 from imu_calibration.cli.main import main
 from imu_calibration.errors import InputError
 from imu_calibration.samples import ImuSamples, JointSamples

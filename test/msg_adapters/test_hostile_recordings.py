@@ -21,7 +21,7 @@ from msg_adapters.encode import encode_imu, encode_joints
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import MISSING_JOINT, MOST_JOINTS, joint_row
 from msg_adapters.layout import Packed
-from msg_adapters.qos import spelled_out
+from msg_adapters.rosbag2 import spelled_out
 
 from worlds.limited import limited, refused, survived
 from worlds.small_bags import write_small_bag

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.errors import DocumentError
 from imu_calibration.nodes import adoption
 from imu_calibration.nodes.adoption import adopt, again

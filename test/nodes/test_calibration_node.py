@@ -9,7 +9,7 @@ import yaml
 from test_by_hand import GRAVITY, simulate
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
-from imu_calibration.calibration.document_parts import calibration_from_text, calibration_to_text
+from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
 from imu_calibration.diagnosis.workflow import diagnose_recording
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.table import Table

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.documents import version_of
 from imu_calibration.effects.base import Role
 from imu_calibration.errors import InputError
@@ -27,8 +27,8 @@ from std_msgs.msg import String  # noqa: E402
 from imu_calibration.nodes import compensator_diagnostics, compensator_node, inputs  # noqa: E402
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
 from imu_calibration.nodes.compensator_settings import CompensatorSettings  # noqa: E402
+from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
 from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
-from imu_calibration.nodes.qos import latched_qos  # noqa: E402
 
 from ros.live_station import Station  # noqa: E402
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.documents import version_of
 from imu_calibration.nodes.message_compensation import LiveCompensation
@@ -62,7 +62,7 @@ def bench(tmp_path_factory):
     from sensor_msgs.msg import Imu
     from std_msgs.msg import String
 
-    from imu_calibration.nodes.qos import input_qos, latched_qos, output_qos
+    from imu_calibration.nodes.inputs import input_qos, latched_qos, output_qos
     folder = tmp_path_factory.mktemp('calibrations')
     for name, text in TEXT.items():
         folder.joinpath(f'{name}.yaml').write_text(text)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.constants import DEG
 from msg_adapters.encode import encode_imu, rows
 from msg_adapters.imu_stream import ImuStream

@@ -12,7 +12,7 @@ from std_msgs.msg import String  # noqa: E402
 
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
 from imu_calibration.nodes.complaints import Complaints  # noqa: E402
-from imu_calibration.nodes.qos import latched_qos  # noqa: E402
+from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
 
 pytestmark = pytest.mark.live
 

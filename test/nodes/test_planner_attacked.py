@@ -13,7 +13,7 @@ from action_msgs.msg import GoalStatus, GoalStatusArray  # noqa: E402
 from rclpy.qos import qos_profile_action_status_default  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 
-from imu_calibration.nodes.other_drivers import OtherDrivers  # noqa: E402
+from imu_calibration.nodes.joint_commands import OtherDrivers  # noqa: E402
 
 from ros.planner_bench import PlannerBench  # noqa: E402
 

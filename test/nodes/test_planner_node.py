@@ -211,8 +211,8 @@ def test_the_worker_waits_until_the_joints_rest_and_not_for_ever():
 def test_joint_states_that_came_while_it_was_busy_are_all_taken_at_once(monkeypatch):
     from sensor_msgs.msg import JointState
 
+    from imu_calibration.nodes.inputs import output_qos
     from imu_calibration.nodes.planner_node import PlannerNode
-    from imu_calibration.nodes.qos import output_qos
     with OneProcess(monkeypatch) as bench:
         planner = bench.start(PlannerNode, {'table_file': str(TABLE)})
         publisher = bench.node.create_publisher(JointState, 'joint_states', output_qos())
@@ -326,7 +326,7 @@ def test_a_class_that_the_six_faces_leave_is_driven_apart_and_a_node_that_ends_l
     from sensor_msgs.msg import JointState
     from visualization_msgs.msg import MarkerArray
 
-    from imu_calibration.nodes.qos import latched_qos
+    from imu_calibration.nodes.inputs import latched_qos
     with Loop(tmp_path / 'out.txt') as loop:
         # A finding that joins the calibration widens what it is mixed up with, and the motions for that part the class on their way.
         loop.begin(tmp_path, {'stall_patience': 30.0, 'silence': 10.0, 'first_speed': 0.1}, {'model_as_asked': True}, profile='six_faces', hide='soft_spring', hide_size=1.8, seed=1, time_factor=8.0,

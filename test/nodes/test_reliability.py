@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.document_parts import calibration_from_text
+from imu_calibration.calibration.document_text import calibration_from_text
 from imu_calibration.samples import ImuSamples
 from msg_adapters.write import write_session
 

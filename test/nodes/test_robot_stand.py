@@ -21,8 +21,8 @@ from std_msgs.msg import String  # noqa: E402
 
 from imu_calibration.nodes import planner_node, robot_stand  # noqa: E402
 from imu_calibration.nodes.calibration_node import CalibrationNode  # noqa: E402
+from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
 from imu_calibration.nodes.planner_node import PlannerNode  # noqa: E402
-from imu_calibration.nodes.qos import latched_qos  # noqa: E402
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of  # noqa: E402
 
 from ros.one_process import OneProcess  # noqa: E402

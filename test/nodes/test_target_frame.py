@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.samples import ImuSamples
 from msg_adapters.encode import encode_imu
 
@@ -25,7 +25,7 @@ from rclpy.parameter import Parameter  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
-from imu_calibration.nodes.qos import latched_qos  # noqa: E402
+from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
 from imu_calibration.nodes.static_frames import TOPIC  # noqa: E402
 
 from ros.message_package import make_package, why_not  # noqa: E402

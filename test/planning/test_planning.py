@@ -9,7 +9,7 @@ import yaml
 from refusal import refused
 
 from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.status import tolerances_of

@@ -9,7 +9,7 @@ from refusal import refused
 
 from imu_calibration import files
 from imu_calibration.by_hand.workflow import calibrate_without_table
-from imu_calibration.calibration import live_collector, verdict
+from imu_calibration.calibration import collector, verdict
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.options import CalibrationOptions
@@ -106,7 +106,7 @@ def test_columns_of_a_window_are_computed_once_for_its_statistics_and_its_residu
     live = LiveCalibration(table, PLAIN)
     live.push(first)
     live.solve()
-    calls = counting(monkeypatch, live_collector, 'columns')
+    calls = counting(monkeypatch, collector, 'columns')
     windows = live.push(second)
     told = live.residuals(windows)
     assert len(told) > len(windows) > 10 and len(calls) == 2 * len(windows)

@@ -7,7 +7,7 @@ from imu_calibration.preflight.evidence import GOOD, NOTE, WARNING
 from imu_calibration.preflight.message_checks import ABSENT, OLD, QUANTITIES, MessageEvidence, check_messages
 from imu_calibration.samples import ImuSamples
 from msg_adapters.encode import encode_imu, rows
-from msg_adapters.imu_heads import ImuHeads
+from msg_adapters.imu_stream import ImuHeads
 
 KNOWN = np.diag([1e-4, 2e-4, 3e-4])
 NONE = np.diag([ABSENT, 0.0, 0.0])

@@ -15,8 +15,8 @@ from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence
 from imu_calibration.by_hand.model import unpack
 from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTurn, hand_options
 from imu_calibration.by_hand.preintegration import integrate_turn
-from imu_calibration.calibration.live_settings import LiveByHandSettings
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.session import LiveByHandSettings
 from imu_calibration.errors import InputError, NotObservableError
 from imu_calibration.estimation.variance_components import estimate_group_variances, student_factor
 from imu_calibration.reference.earth import normal_gravity

@@ -13,8 +13,8 @@ from imu_calibration.by_hand.advice import missing_motion
 from imu_calibration.by_hand.live import LiveByHand
 from imu_calibration.by_hand.status import FACES, unseen
 from imu_calibration.by_hand.workflow import calibrate_without_table
-from imu_calibration.calibration.live_settings import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.samples import ImuSamples, SampleBlock
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.diagnosis.distance import DistanceSums
+from imu_calibration.diagnosis.traces import DistanceSums
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.reference.joint_motion import JointMotion

@@ -104,7 +104,7 @@ class Station:
         """Return the list that calibration documents of a topic go to."""
         from std_msgs.msg import String
 
-        from imu_calibration.nodes.qos import latched_qos
+        from imu_calibration.nodes.inputs import latched_qos
         documents = []
         note = self.node.create_subscription(String, topic, lambda message: documents.append(message.data), latched_qos())
         self.subscriptions.append(note)

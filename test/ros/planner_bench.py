@@ -11,8 +11,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from imu_calibration.nodes.inputs import output_qos
 from imu_calibration.nodes.planner_node import PlannerNode
-from imu_calibration.nodes.qos import output_qos
 
 from ros.one_process import OneProcess
 

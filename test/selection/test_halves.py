@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.selection.halves import agree
+from imu_calibration.selection.evidence import agree
 
 
 @pytest.mark.parametrize('first, second, alike', [

@@ -8,8 +8,8 @@ import pytest
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.selection import investigation
 from imu_calibration.selection.evidence import Evidence, WindowEvidence
-from imu_calibration.selection.pairs import _Blocks, best_pairs
 from imu_calibration.selection.questions import Question
+from imu_calibration.selection.rivals import _Blocks, best_pairs
 from imu_calibration.selection.search import PENALTY, Search
 
 NAMES = ('accel_quadratic', 'accel_cubic', 'accel_cross_product', 'accel_scale_asymmetry')

@@ -10,7 +10,7 @@ from imu_calibration.reference.joint_motion import JointMotion
 from imu_calibration.reference.table import Table
 from imu_calibration.segmentation.window import Window
 from imu_calibration.segmentation.window_finder import MotionGatherer
-from imu_calibration.selection import clipping, investigation
+from imu_calibration.selection import investigation, saturation
 from imu_calibration.selection.saturation import find_saturation, may_be_clipped, without_clipped
 from imu_calibration.use_cases.diagnose import diagnose
 
@@ -78,8 +78,8 @@ def test_a_coarse_accelerometer_on_a_vertical_shaft_is_diagnosed(recordings):
 
 def test_locked_windows_show_no_limit(monkeypatch):
     windows, seen = windows_of(np.random.default_rng(0).normal(0.0, 1.0, (1200, 3)), 12), []
-    monkeypatch.setattr(clipping, '_limits', lambda some, table, model: (seen.extend(map(id, some)), ([], {}, None))[1])
-    _, locked, _ = clipping.without_clipping(windows, None, None)
+    monkeypatch.setattr(saturation, '_limits', lambda some, table, model: (seen.extend(map(id, some)), ([], {}, None))[1])
+    _, locked, _ = saturation.without_clipping(windows, None, None)
     assert locked.sum() == 3 and seen == [id(window) for window, out in zip(windows, locked) if not out]
 
 
@@ -88,10 +88,10 @@ def test_a_limit_that_one_window_alone_shows_is_seen(monkeypatch):
     force, seen = np.random.default_rng(0).normal(0.0, 1.0, (1200, 3)), []
     force[1020:1040, 2] = 9.0
     windows, limit = windows_of(force, 12), SimpleNamespace(sensor='accelerometer', level=9.0)
-    monkeypatch.setattr(clipping, '_limits', lambda some, table, model: (seen.extend(map(id, some)), ([limit], {}, None))[1])
-    monkeypatch.setattr(clipping, 'predictions', lambda *given, **named: None)
-    monkeypatch.setattr(clipping, 'without_clipped', lambda some, *given, **named: some)
-    _, locked, _ = clipping.without_clipping(windows, None, None)
+    monkeypatch.setattr(saturation, '_limits', lambda some, table, model: (seen.extend(map(id, some)), ([limit], {}, None))[1])
+    monkeypatch.setattr(saturation, 'predictions', lambda *given, **named: None)
+    monkeypatch.setattr(saturation, 'without_clipped', lambda some, *given, **named: some)
+    _, locked, _ = saturation.without_clipping(windows, None, None)
     assert id(windows[10]) in seen and locked.sum() == 2
 
 
@@ -100,7 +100,7 @@ def test_what_is_always_at_its_limit_does_not_empty_the_recording(monkeypatch):
     table = Table.from_mapping(pair.table)
     gatherer = MotionGatherer(table)
     windows = gatherer.push(pair.first.block) + gatherer.finish()
-    monkeypatch.setattr(clipping, 'may_be_clipped', lambda windows, sensor: True)
-    monkeypatch.setattr(clipping, 'without_clipped', lambda *given, **known: [])
+    monkeypatch.setattr(saturation, 'may_be_clipped', lambda windows, sensor: True)
+    monkeypatch.setattr(saturation, 'without_clipped', lambda *given, **known: [])
     found = investigation.investigate(windows, table, SensorModel(joint_names=table.joint_names))
     assert found.used == [window for window in windows if window.kind != 'unused'] and not found.limits

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imu_calibration import documents
-from imu_calibration.calibration.document_parts import calibration_from_text
+from imu_calibration.calibration.document_text import calibration_from_text
 from imu_calibration.cli.main import main
 
 BAG = Path(__file__).parents[2] / 'bags' / 'sample_session'

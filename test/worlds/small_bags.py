@@ -3,7 +3,7 @@
 import numpy as np
 import yaml
 
-from imu_calibration.calibration.document_parts import calibration_to_text
+from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.documents import to_text
 from imu_calibration.samples import ImuSamples, JointSamples
 from msg_adapters.write import write_session
