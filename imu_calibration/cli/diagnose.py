@@ -13,6 +13,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common = parser.common.add_argument
     parser.add_argument('bag', metavar='BAG', help=arguments.BAG)
     common('--output', metavar='DIR', required=True, help='folder for diagnosis.json, calibration.yaml and report.html')
+    common('--mcap', metavar='FILE', help='also write measured and simulated signals and the residuals as MCAP for Foxglove')
     arguments.add_gravity_arguments(parser)
     arguments.add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
     arguments.add_topic_arguments(parser)
@@ -25,11 +26,16 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration import files
     from imu_calibration.cli.show import console, warn
     from imu_calibration.use_cases.diagnose import diagnose
+    from imu_calibration.use_cases.foxglove_file import foxglove
+    if options.mcap:
+        foxglove()   # before the work, not after it
     arguments.require_place(options, 'diagnose', [options.bag])
     with files.output_folder(options.output) as folder:
         found = diagnose(options.bag, arguments.stand_of(options), **arguments.choices_of(options))
         warn(found.calibration.statistics['preflight'])
         found.save(folder)
+        if options.mcap:
+            found.save_overlay(options.mcap)
         out = console()
         out.print(str(found), soft_wrap=True)
         also = '' if found.proposed is None else ', and extended.yaml with the proposed formula in the model,'

@@ -75,6 +75,12 @@ class Diagnosed:
         if self.proposed is not None:
             files.write_text(place / 'extended.yaml', calibration_to_text(self.proposed))
 
+    def save_overlay(self, path: str | PathLike) -> None:
+        """Write measured and simulated signals, residuals, spectra and histograms as MCAP for Foxglove (`overlay_file.overlay_bytes`)."""
+        from imu_calibration.use_cases.overlay_file import overlay_bytes
+        diagnosis = self.result.diagnosis
+        files.write_whole(path, overlay_bytes(diagnosis.traces, diagnosis.baseline.model.joint_names))
+
     def __str__(self):
         return '\n'.join(self.result.lines)
 

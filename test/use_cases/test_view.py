@@ -18,6 +18,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.diagnose import diagnose
 from imu_calibration.use_cases.foxglove_file import PARAMETERS, RESIDUAL, SCHEMAS, SPECTRUM, SPHERE, _from_x, scene_of
 from imu_calibration.use_cases.view import _coverage, view
 
@@ -160,3 +161,22 @@ def test_the_layout_asks_for_what_the_file_holds(written):
             found = found[0] if isinstance(found, list) else found
         assert names and found is not None
     assert set(re.findall(r'"panelType": "(\w+)"', text)) == {'ThreeDee', 'Plot', 'Table'}
+
+
+def test_the_overlay_of_a_diagnosis_contains_its_segments_residuals_spectra_and_histograms(tmp_path):
+    pytest.importorskip('foxglove', reason='the extra view is not installed')
+    found = diagnose(SESSION, TABLE)
+    found.save_overlay(tmp_path / 'overlay.mcap')
+    written, traces = read(tmp_path / 'overlay.mcap'), found.result.diagnosis.traces
+    segment = traces.segments['gyroscope'][2]
+    times, rows = zip(*written['/overlay/gyroscope/z'][2])
+    assert np.allclose(times, segment.time, rtol=0, atol=1e-9)
+    for name in ('measured', 'simulated before', 'simulated after'):
+        assert [row[name.replace(' ', '_')] for row in rows] == segment.signals[name].tolist()
+    residual = written['/residual/accelerometer'][2]
+    assert [row['after']['y'] for _, row in residual] == traces.after['accelerometer'][:, 1].tolist()
+    assert set(residual[0][1]['angle']) == {'outer', 'middle', 'inner'}
+    [(start, spectrum), (end, _)] = written['/residual_spectrum/accelerometer'][2]
+    assert (start, end) == pytest.approx((0.0, traces.time[-1])) and len(spectrum['frequency']) == len(spectrum['after']['x']) > 5
+    histogram = written['/residual_histogram/gyroscope'][2][0][1]
+    assert 0.9 * len(traces.time) < sum(histogram['before']['x']) <= len(traces.time) and len(histogram['residual']) == 40

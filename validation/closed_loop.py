@@ -1,0 +1,169 @@
+"""
+Closed loop: diagnose a session with a hidden cause, simulate the finding on the same motion, diagnose the simulation, compare.
+
+Usage: `python -m validation.closed_loop [--seed N] [--only NAME ...]` prints one line for each loop and the table. Causes: each effect of the
+catalogue with a known size, one formula per template of the grammar, and, for each pair in `indistinguishable_from`, the other member at the
+size that the diagnosis estimated for it. In the second diagnosis the true size is that of the first finding, so that
+z = (second size - first size) / (sd of the second) has a standard deviation of 1 where the reported sds are correct.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.use_cases.choices import catalogue_of
+from imu_calibration.use_cases.diagnose import diagnose
+from imu_calibration.use_cases.simulate import replay, simulate
+from validation.section import markdown_table
+
+TEMPLATES = {
+    'product': ('accelerometer', 'f_x * w_y', 'm/s^2/(m/s^2)/(rad/s)', 5e-3),
+    'cube': ('accelerometer', 'w_z ** 3', 'm/s^2/(rad/s)^3', 5e-2),
+    'angular acceleration': ('accelerometer', 'alpha_y * f_x', 'm/s^2/(m/s^2)/(rad/s^2)', 3e-2),
+    'magnitude': ('gyroscope', 'abs(f_z)', 'rad/s/(m/s^2)', 1e-4),
+    'sign': ('gyroscope', 'sign(f_y) * w_x', 'rad/s/(rad/s)', 2e-3),
+    'sum of squares': ('gyroscope', 'f_x ** 2 + f_y ** 2', 'rad/s/(m/s^2)^2', 1e-5),
+    'temperature': ('gyroscope', '(temperature_c - temperature_ref_c) * f_x * w_z', 'rad/s/K/(m/s^2)/(rad/s)', 1e-4),
+    'time': ('accelerometer', 'time * f_y * w_x', 'm/s^2/s/(m/s^2)/(rad/s)', 5e-5),
+    'order of a joint': ('accelerometer', 'cos(5 * angle_1)', 'm/s^2', 2e-2),
+    'orders of two joints': ('gyroscope', 'cos(2 * angle_1) * sin(3 * angle_2)', 'rad/s', 2e-3),
+    'order and joint rate': ('gyroscope', 'joint_rate_2 * sin(4 * angle_2)', 'rad/s/(rad/s)', 2e-3),
+    'joint rate': ('accelerometer', 'joint_rate_1 * abs(joint_rate_1)', 'm/s^2/(rad/s)^2', 3e-2),
+    'table vector and order': ('gyroscope', ['cos(2 * angle_1) * c_xx', 'cos(2 * angle_1) * c_yx', 'cos(2 * angle_1) * c_zx'], 'rad/s', 1e-3),
+}
+"""Template of the grammar -> (sensor, column, unit, size of each axis, SI)."""
+SIZE = 1.0
+"""Hidden size of a catalogue effect as a share of its largest plausible one."""
+
+
+def measured_sessions(names):
+    """Yield (name, function of a seed that simulates the session) of each cause."""
+    for effect in catalogue_of(None).effects().values():
+        if effect.plausible and effect.name not in ('bias', 'matrix') and (not names or effect.name in names):
+            yield effect.name, lambda seed, name=effect.name: simulate('random', effects=[name], size=SIZE, grade='tactical', seed=seed)
+    for template, (sensor, column, unit, size) in TEMPLATES.items():
+        if names and template not in names:
+            continue
+        definition = {'sensor': sensor, 'column': column, 'unit': unit, 'tolerance': size / 100, 'largest': size, 'text': template}
+        yield template, lambda seed, definition=definition, template=template: simulate(
+            'random', effects=['hidden_formula'], size=1.0, grade='tactical', seed=seed, catalogue={'hidden_formula': definition},
+            temperature='temperature' in template)
+
+
+def sizes_of(found):
+    """Return {name: (values, sds)} of the findings and formulas, implausible findings excepted."""
+    sizes = {finding.effect: tuple(np.array([[value, sd] for value, sd, _ in finding.parameters.values()]).T)
+             for finding in found.findings if not finding.implausible}
+    for rest in found.result.diagnosis.unexplained.values():
+        if rest.proposal:
+            sizes |= {column: pair for column, *pair in zip(rest.proposal.columns, rest.proposal.values, rest.proposal.sds)}
+    return sizes
+
+
+def loop(measured, simulated, seed):
+    """Return (row, first diagnosis): the second diagnosis is of a simulation of the first result, `simulated`, on the same motion."""
+    first = diagnose(measured.samples, measured.table)
+    return compared(first, simulated(first), measured, seed), first
+
+
+def compared(first, calibration, measured, seed):
+    """Simulate a calibration on the motion of a session, diagnose the simulation and compare names and sizes."""
+    second = diagnose(replay(measured.samples, calibration, measured.table, seed=seed).samples, measured.table)
+    one, other = sizes_of(first), sizes_of(second)
+    classes = {finding.effect: {finding.effect, *finding.indistinguishable_from} for finding in second.findings}
+    classes |= {column: {column, *rest.proposal.alike} for rest in second.result.diagnosis.unexplained.values() if rest.proposal
+                for column in rest.proposal.columns}
+    again = {name for name in one if any(name in members for members in classes.values())}
+    z = [value for name in one.keys() & other.keys() if one[name][0].shape == other[name][0].shape
+         for value in (other[name][0] - one[name][0]) / other[name][1]]
+    return {'found': sorted(one), 'again': sorted(again), 'new': sorted(name for name in other if not classes[name] & one.keys()), 'z': z}
+
+
+def extended(found):
+    """Return the calibration with the findings and formulas."""
+    return found.proposed or found.calibration
+
+
+def exchanged(calibration, finding, mate):
+    """Return the calibration with `mate` at its estimated size in the place of a finding, or None where it has no size."""
+    sizes = finding.sizes_of_mates.get(mate)
+    if not sizes:
+        return None
+    model, sensor = calibration.model, catalogue_of(None).owner_of(mate)
+    less = replace(model, point={}, **{finding.sensor: tuple(name for name in getattr(model, finding.sensor) if name != finding.effect)})
+    wider = less.with_effect(sensor, mate)
+    values = wider.start_from(model, calibration.values)
+    names = wider.param_names
+    for name, (value, _) in sizes.items():
+        if name not in names:
+            return None
+        values[names.index(name)] = value
+    return replace(calibration, model=replace(wider, point={}), values=values, covariance=np.zeros((len(values),) * 2),
+                   status=(calibration.status[0],) * len(values))
+
+
+def run(names, seed):
+    """Print a line for each loop and return the rows."""
+    rows = []
+    for seed, (name, make) in enumerate(measured_sessions(names), seed):
+        start = time.process_time()
+        try:
+            measured = make(seed)
+            row, first = loop(measured, extended, seed + 1000)
+            rows.append({'cause': name, 'kind': 'formula' if name in TEMPLATES else 'effect'} | row)
+            for finding in first.findings:
+                for mate in finding.indistinguishable_from:
+                    other = exchanged(first.calibration, finding, mate)
+                    if other is not None:
+                        rows.append({'cause': f'{mate} for {finding.effect}', 'kind': 'pair'} | compared_mate(first, finding, mate, other, measured, seed + 2000))
+        except ImuCalibrationError as error:
+            rows.append({'cause': name, 'kind': 'refused', 'found': [], 'again': [], 'new': [], 'z': [], 'why': str(error)})
+        for row in rows:
+            if not row.get('printed'):
+                row['printed'] = True
+                print(f"{row['cause']}: found {', '.join(row['found']) or 'nothing'}; again {', '.join(row['again']) or 'nothing'}; new "
+                      f"{', '.join(row['new']) or 'nothing'}; z {' '.join(f'{z:.1f}' for z in row['z'])} {row.get('why', '')} "
+                      f'({time.process_time() - start:.0f} s)', flush=True)
+    return rows
+
+
+def compared_mate(first, finding, mate, calibration, measured, seed):
+    """Return the row of a simulation with `mate` in the place of a finding: its class must be found again."""
+    second = diagnose(replay(measured.samples, calibration, measured.table, seed=seed).samples, measured.table)
+    expected = [mate if each.effect == finding.effect else each.effect for each in first.findings if not each.implausible]
+    classes = {each.effect: {each.effect, *each.indistinguishable_from} for each in second.findings}
+    other, z = sizes_of(second), []
+    if mate in other:
+        estimated = next(each for each in second.findings if each.effect == mate).parameters
+        z = [(estimated[name][0] - value) / estimated[name][1] for name, (value, _) in finding.sizes_of_mates[mate].items() if name in estimated]
+    again = [name for name in expected if any(name in members for members in classes.values())]
+    return {'found': sorted(expected), 'again': sorted(again), 'new': sorted(name for name in classes if not classes[name] & {*expected, finding.effect}), 'z': z}
+
+
+def table_of_rows(rows):
+    """Return the summary as a Markdown table."""
+    lines = []
+    for kind in ('effect', 'formula', 'pair'):
+        own = [row for row in rows if row['kind'] == kind]
+        told = [row for row in own if row['found']]
+        z = np.array([value for row in own for value in row['z']])
+        lines.append((kind, str(len(own)), str(len(told)), str(sum(row['again'] == row['found'] for row in told)),
+                      str(sum(bool(row['new']) for row in own)), '–' if not z.size else f'{np.sqrt(np.mean(z ** 2)):.2f}',
+                      '–' if not z.size else f'{np.mean(np.abs(z) < 2):.2f} of {z.size}'))
+    return markdown_table(('cause', 'sessions', 'with a finding', 'same finding', 'other names', 'rms z', 'share with |z| < 2'), lines)
+
+
+def main():
+    """Read the arguments, run, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--only', nargs='+', default=())
+    options = parser.parse_args()
+    print(table_of_rows(run(set(options.only), options.seed)))
+
+
+if __name__ == '__main__':
+    main()
