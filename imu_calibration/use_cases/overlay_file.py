@@ -1,5 +1,6 @@
 """MCAP of a simulation over the measurement for Foxglove: the content of the overlay of a diagnosis report, as JSON with schemas."""
 
+from collections.abc import Sequence
 from io import BytesIO
 from typing import Any
 
@@ -14,7 +15,7 @@ OVERLAY, RESIDUAL, SPECTRUM, HISTOGRAM = '/overlay', '/residual', '/residual_spe
 WHEN = ('before', 'after')
 
 
-def overlay_bytes(traces: Traces, joint_names: tuple[str, ...]) -> bytes:
+def overlay_bytes(traces: Traces, joint_names: Sequence[str]) -> bytes:
     """
     Return the MCAP; SI units, log times in s since the first sample.
 
