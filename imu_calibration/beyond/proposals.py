@@ -70,6 +70,11 @@ class Proposal:
 
     @property
     def sentence(self) -> str:
+        """Description of the proposal with the motion that confirms it."""
+        return self.relation + (f'; to confirm it: {self.motion}' if self.motion else '')
+
+    @property
+    def relation(self) -> str:
         """Description of the proposal."""
         parts = [f'{_size(effect, value, sd)}' for effect, value, sd in zip(self.effects, self.values, self.sds)]
         text = (f'{100 * self.share:.0f} % of it ({100 * self.ci95[0]:.0f} to {100 * self.ci95[1]:.0f} %, on windows held out) follows '
@@ -80,7 +85,7 @@ class Proposal:
             text += ' here, but the remaining axes or sensor contradict it' * (self.nearest[1] > LEAST_SHARE)
         if self.alike:
             text += f'; collinear in this recording: {" or ".join(self.alike)}'
-        return text + (f'; to confirm it: {self.motion}' if self.motion else '')
+        return text
 
     def to_mapping(self) -> dict:
         """Return the proposal as plain data."""

@@ -48,12 +48,12 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
     settings : ByHandSettings
 
     """
-    poses, model, known, uncorrected = hand.poses, hand.model, _Rows(hand, turns), uncorrected_by_hand(hand)
+    poses, model, uncorrected = hand.poses, hand.model, uncorrected_by_hand(hand)
     plain = replace(model, gyro_factor=1.0).nominal
     judged = poses.time >= (LAST_SHARE * end_by_hand(poses) if uncorrected.sizes else 0.0)
     norms, angles = [], []
-    for out in _folds(poses, settings):
-        values, part = _applied(model, known.values_without(out), uncorrected.centre), _selected(poses, out & judged)
+    for out, without in held_out_values(hand, turns, settings):
+        values, part = _applied(model, without, uncorrected.centre), _selected(poses, out & judged)
         left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last]) and judged[turn.first]]
         norms.append([(np.linalg.norm(_corrected(model, each, part.force, np.zeros_like(part.force), part.temperature_c).force, axis=1)
                        - hand.gravity)**2 for each in (plain, values)])
@@ -65,6 +65,12 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
     if sum(part[0].size for part in angles) >= TURNS_LEAST:
         proof['gyroscope'] = _entry(angles, PER_TURN)
     return proof
+
+
+def held_out_values(hand: HandCalibration, turns: Sequence[TurnData], settings: ByHandSettings) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return (mask of the held-out poses, parameters estimated without them) of each fold; none with too few poses."""
+    known = _Rows(hand, turns)
+    return [(out, known.values_without(out)) for out in _folds(hand.poses, settings)]
 
 
 def _folds(poses, settings):

@@ -6,6 +6,8 @@ from typing import ClassVar
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import HandCalibration
+from imu_calibration.by_hand.options import hand_options
+from imu_calibration.by_hand.proof import held_out_values
 from imu_calibration.calibration.result import CalibrationResult, ErrorBudget, ReferenceErrors, WindowErrors
 from imu_calibration.effects.base import Role
 from imu_calibration.segmentation.window import Window, WindowKind
@@ -45,11 +47,14 @@ class HandResult(CalibrationResult):
         return self.hand.poses.force[0], self.hand.poses.rate[0]
 
     def window_errors(self) -> WindowErrors:
-        """Return the errors of the poses before and after: relative to gravity along its estimated direction, and to zero rate."""
+        """Return the errors of the poses, after: held out; relative to gravity along its estimated direction, and to zero rate."""
         hand, poses = self.hand, self.hand.poses
         force, rate = poses.force, poses.rate
         true, zero = hand.gravity * hand.state.up, np.zeros_like(rate)
         corrected_force, corrected_rate = hand.compensate(force, rate, poses.time, temperature_c=poses.temperature_c)
+        for out, values in held_out_values(hand, hand.used_turns, hand_options(self.options).settings):
+            corrected = hand.model.compensate(values, force, rate, time=poses.time, temperature_c=poses.temperature_c)
+            corrected_force[out], corrected_rate[out] = (part[out] for part in corrected)
         samples = max(int(poses.stop[-1]), 1)
         time = (poses.start + poses.stop) / 2 * self.gathered.duration / max(samples - 1, 1)
         scatter = [float(hand.statistics.get(f'{name}_scatter_sd', 0.0)) for name in ('pose', 'drift')]

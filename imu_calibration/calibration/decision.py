@@ -63,12 +63,13 @@ def reason_of(entry: Mapping | None) -> str:
     earlier = entry.get('earlier')
     more = f', {error_text(earlier["after"], entry["unit"])} with the earlier calibration' if earlier else ''
     cause = OTHER_ATTITUDES if entry.get('one_attitude') else '' if decide(entry) is HELPS else _cause(entry)
-    return (f'{_errors(entry, entry["unit"])} on held-out data ({entry["windows"]} windows, {_ratio(entry)}){more}{cause}')
+    return (f'{_errors(entry, entry["unit"])} on held-out data ({entry["windows"]} windows, after / before {ratio_text(entry)})'
+            f'{more}{cause}')
 
 
 def worse_regimes(entry: Mapping) -> list[str]:
     """Return a line for each regime in which the error grows."""
-    return [f'{_errors(part, part.get("unit", entry["unit"]))} on held-out data of the regime {name} ({_ratio(part)})'
+    return [f'{_errors(part, part.get("unit", entry["unit"]))} on held-out data of the regime {name} (after / before {ratio_text(part)})'
             for name, part in harmed(entry).items()]
 
 
@@ -89,9 +90,10 @@ def _errors(entry, unit):
     return f'error {error_text(entry["before"], unit)} to {error_text(entry["after"], unit)}'
 
 
-def _ratio(entry):
+def ratio_text(entry: Mapping) -> str:
+    """Return the interval of error after / error before as it is printed everywhere."""
     low, high = entry['ci95']
-    return f'after / before {low:.2g} to {high:.2g}'
+    return f'{low:.2g} to {high:.2g}'
 
 
 def _cause(entry):

@@ -33,14 +33,9 @@ class WindowErrors:
     before: dict
     """Sensor -> error of the mean reading, shape (n, 3)."""
     after: dict
-    """Sensor -> error of the corrected mean, shape (n, 3)."""
+    """Sensor -> error of the mean corrected with parameters that were estimated without the window, shape (n, 3)."""
     floor: dict
     """Sensor -> sd of the mean from noise, shape (n, 3)."""
-
-    def rms(self, sensor: str, which: str, kind: str | None = None) -> float:
-        """Return the root mean square error of 'before' or 'after', over windows of one kind or all."""
-        errors = getattr(self, which)[sensor][(self.kind == kind) if kind else slice(None)]
-        return float(np.sqrt(np.mean(errors**2))) if errors.size else float('nan')
 
 
 @dataclass(frozen=True)

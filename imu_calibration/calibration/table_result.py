@@ -12,13 +12,14 @@ from typing import ClassVar
 
 import numpy as np
 
+from imu_calibration.calibration.held_out import HeldOut, HeldOutBlock
+from imu_calibration.calibration.proof import nominal_values
 from imu_calibration.calibration.result import CalibrationResult, ErrorBudget, ReferenceErrors, WindowErrors
 from imu_calibration.constants import ARCMIN
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import References, columns, warped_reference
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients, predict, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.observability import tolerance_scaled_singular_values
 from imu_calibration.estimation.prior import fixed_parameters, make_prior
@@ -214,29 +215,6 @@ def _output(model, sensor, values, table, motion, temperature):
     return sensor_output(model, sensor, values, ref=warped_reference(model, sensor, table, motion=motion, temperature_c=temperature))
 
 
-def window_residuals(result: 'TableResult') -> dict:
-    """
-    Return residuals per window before and after calibration: those of a nominal sensor, and those of the model.
-
-    Returns
-    -------
-    dict
-        'time', 'kind', 'count', and per sensor 'before', 'after', each shape (n_windows, 3): residuals of window means.
-
-    """
-    solution, rows = result.solution, result.gathered.accumulator.rows
-    wide, narrow = result.gathered_model, result.model
-    accumulator = result.gathered.accumulator if wide is narrow else restrict(result.gathered.accumulator, wide, narrow)
-    found = {'time': np.array([r.time for r in rows]), 'kind': [r.kind for r in rows], 'count': np.array([r.count for r in rows])}
-    nominal = narrow.start()
-    for sensor in SENSORS:
-        means = np.array([row.sensors[sensor].mean for row in accumulator.rows])
-        after, before = (coefficients(narrow, sensor, values) for values in (solution.values, np.where(np.isfinite(nominal), nominal, 0.0)))
-        found[sensor] = {'before': means[:, -3:] - means[:, :-3] @ before, 'after': means[:, -3:] - means[:, :-3] @ after,
-                         'measured': means[:, -3:], 'predicted': means[:, :-3] @ after}
-    return found
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TableResult(CalibrationResult):
     """A calibration on a table with the data for a report."""
@@ -280,18 +258,23 @@ class TableResult(CalibrationResult):
         return row.sensors['accelerometer'].mean[-3:], row.sensors['gyroscope'].mean[-3:]
 
     def window_errors(self) -> WindowErrors:
-        """Return the errors of window means before and after, against the table."""
-        found, rows = window_residuals(self), self.gathered.accumulator.rows
-        kind, count = np.array(found['kind']), np.array(found['count'], float)
+        """Return the errors of window means before and after, against the table; after: predicted without the fold of the window."""
+        held_out = self.gathered.held_out if self.gathered.held_out.n_windows else HeldOut([HeldOutBlock(self.gathered.accumulator)])
+        held_out, model = held_out.restricted(self.gathered_model, self.model), self.model
+        folds = held_out.values_without(self.solution) if len(held_out.blocks) > 1 else [self.solution.values]
+        rows = [row for block in held_out.blocks for row in block.accumulator.rows]
+        fold = [k % len(folds) for k, block in enumerate(held_out.blocks) for _ in block.accumulator.rows]
+        count = np.array([row.count for row in rows], float)
         parts = {name: {} for name in ('measured', 'true', 'before', 'after', 'floor')}
         for sensor in SENSORS:
-            true = np.array([row.sensors[sensor].mean[self.gathered_model.columns_of(sensor, Role.LINEAR)] for row in rows])
-            noise = self.solution.noise[sensor]
-            parts['measured'][sensor], parts['true'][sensor] = found[sensor]['measured'], true
-            parts['before'][sensor] = found[sensor]['before']
-            parts['after'][sensor] = found[sensor]['after'] @ np.linalg.inv(self.calibration.of(sensor, Role.LINEAR)).T
+            means, noise = np.array([row.sensors[sensor].mean for row in rows]), self.solution.noise[sensor]
+            after = np.array([coefficients(model, sensor, values) for values in folds])[fold]
+            parts['measured'][sensor], parts['true'][sensor] = means[:, -3:], means[:, model.columns_of(sensor, Role.LINEAR)]
+            parts['before'][sensor] = means[:, -3:] - means[:, :-3] @ coefficients(model, sensor, nominal_values(model))
+            parts['after'][sensor] = (means[:, -3:] - np.einsum('ni,nij->nj', means[:, :-3], after)) \
+                @ np.linalg.inv(self.calibration.of(sensor, Role.LINEAR)).T
             parts['floor'][sensor] = np.sqrt(noise.low_variance / count[:, None] + noise.offset_sd**2 + noise.bias_variance)
-        return WindowErrors(found['time'], kind, **parts)
+        return WindowErrors(np.array([row.time for row in rows]), np.array([row.kind for row in rows]), **parts)
 
     def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
         """Return measured values minus those predicted from the motion of the table."""

@@ -20,6 +20,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Print the errors before and after with their interval and the decision; exit code 0 when it helps each sensor, otherwise 3."""
+    from imu_calibration.calibration.decision import ratio_text
     from imu_calibration.cli.show import console, show_table, warn
     from imu_calibration.preflight.checks import warnings
     from imu_calibration.units import error_text
@@ -30,10 +31,9 @@ def run(options: Namespace) -> VerbResult:
     rows = []
     for sensor, entry in found.proof.items():
         for motion, part in (('all', entry), *entry['regimes'].items()):
-            low, high = part['ci95']
             rows.append((sensor, motion, f'{part["seconds"]:.0f}',
                          *(error_text(part[when], part.get('unit', entry['unit'])) for when in ('before', 'after')),
-                         f'{part["after"] / max(part["before"], 1e-300):.3f}', f'{low:.3f} to {high:.3f}'))
+                         f'{part["after"] / max(part["before"], 1e-300):.3f}', ratio_text(part)))
     show_table(out, ('sensor', 'motion', *numbers), rows, numbers=numbers)
     for line in str(found).splitlines():
         out.print(line, soft_wrap=True, markup=False)

@@ -5,6 +5,7 @@ from typing import Any
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.status import DETERMINED
 from imu_calibration.calibration.trust import usage
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.report.budget_section import budget_section
 from imu_calibration.report.geometry import derived_section, lever_section
 from imu_calibration.report.navigation_section import navigation_section
@@ -14,7 +15,7 @@ from imu_calibration.report.page import render
 from imu_calibration.report.parameters import parameter_groups
 from imu_calibration.report.proof_section import proof_section
 from imu_calibration.report.readings import reading_tables
-from imu_calibration.report.residuals import residual_section
+from imu_calibration.report.residuals import draw_windows, residual_section
 from imu_calibration.units import error_text
 
 
@@ -35,7 +36,8 @@ def calibration_report(result: CalibrationResult) -> str:
     return render('calibration.html', title='IMU calibration', verdict=result.verdict, usage=usage(result.calibration),
                   facts=recording_facts(result), proof=proof_section(result.calibration), tiles=tiles(result, navigation),
                   groups=parameter_groups(result),
-                  derived=derived_section(result), residuals=residual_section(result, errors),
+                  derived=derived_section(result), residuals=residual_section(result),
+                  errors=[draw_windows(errors, sensor) for sensor in SENSORS],
                   observability=observability_section(result), levers=lever_section(result), navigation=navigation, at_rest=at_rest,
                   moving=moving, budget=budget_section(result), origin=origin_section(result), observations=result.observations)
 

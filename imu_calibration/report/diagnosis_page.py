@@ -92,7 +92,7 @@ def _next_step(finding):
 
 
 def _tiles(diagnosis):
-    tiles = [{'what': 'effects asked about', 'number': str(len(diagnosis.candidates)), 'unit': '', 'before': None,
+    tiles = [{'what': 'effects tested', 'number': str(len(diagnosis.candidates)), 'unit': '', 'before': None,
               'note': f'{len(diagnosis.not_testable)} more could not be tested'}]
     if diagnosis.findings:
         gain = diagnosis.gain
@@ -115,9 +115,9 @@ def _reduction(gain):
 def _finding(diagnosis, finding, number):
     rows = [{'name': name, 'cells': people(value, sd, unit, quantity=name), 'sigma': text(abs(value) / sd, 2) if sd > 0 else '–'}
             for name, (value, sd, unit) in finding.parameters.items()]
-    return {'number': number, 'title': finding.effect.replace('_', ' '), 'sentence': in_type(finding.explanation), 'rows': rows,
+    return {'number': number, 'title': finding.effect.replace('_', ' '), 'rows': rows,
             'p': chance(finding.p_value), **_gained(finding.gain), 'mates': [n.replace('_', ' ') for n in finding.indistinguishable_from],
-            'motion': finding.separating_motion, 'implausible': finding.implausible, 'figure': draw_finding(diagnosis, finding, number)}
+            'implausible': finding.implausible, 'figure': draw_finding(diagnosis, finding, number)}
 
 
 def _gained(gain):
@@ -132,8 +132,8 @@ def _formula(diagnosis, rest):
             for effect, values, sds in zip(proposal.effects, proposal.values, proposal.sds)
             for k, (axis, value, sd) in enumerate(zip(AXES, values, sds))]
     against = tuple(kind for effect in proposal.effects for kind in effect.against)
-    return {'title': ' and '.join(proposal.columns), 'sentence': f'{_capital(in_type(proposal.sentence))}.', 'rows': rows,
-            'p': chance(proposal.p_value), **_gained(formula_gain(rest)), 'motion': proposal.motion,
+    return {'title': ' and '.join(proposal.columns), 'sentence': f'{_capital(in_type(proposal.relation))}.', 'rows': rows,
+            'p': chance(proposal.p_value), **_gained(formula_gain(rest)),
             'figure': draw(f'formula-{proposal.sensor}', (8.6, 3.1), _AgainstCause(diagnosis, proposal.sensor, against),
                            label=f'Residual against the variable of the formula, before and after: {" and ".join(proposal.columns)}')}
 
@@ -200,7 +200,7 @@ class _AgainstCause:
         for axes, residual, colour, title in ((left, before, BEFORE, 'before'), (right, after, AFTER, 'after')):
             axes.plot(values[some], residual[some], '.', color=colour, markersize=_marker(values, 4), alpha=0.5, mew=0)
             axes.axhline(0, color=GREY, lw=0.6)
-            axes.set_title(f'{title}: rms {text(float(np.sqrt(np.mean(residual**2))))} {unit}')
+            axes.set_title(title)
             axes.set_xlabel(label)
         place, curve = _curve(values, before - after)
         left.plot(place, curve, color=INK, lw=1.8, label='fitted effect')

@@ -13,7 +13,7 @@ BEFORE, AFTER = '#d55e00', '#0072b2'
 AXIS = {'x': '#d55e00', 'y': '#009e73', 'z': '#0072b2'}
 """Colours of the three axes: vermilion, bluish green and blue of Okabe and Ito, distinct for colour-blind readers."""
 STATUS = {'determined': '#2b8a57', 'weak': '#d08a12', 'held': '#b4322c'}
-MARKER = {'static': 'o', 'spin': 's', 'dynamic': '^', 'turn': 's'}
+MARKER = {'x': 'o', 'y': 's', 'z': '^'}
 STYLE: Any = {
     'font.family': 'sans-serif', 'font.sans-serif': ['DejaVu Sans'], 'font.size': 9.5, 'axes.titlesize': 10, 'axes.titleweight': 'bold',
     'axes.titlelocation': 'left', 'axes.labelsize': 9.5, 'axes.labelcolor': GREY, 'axes.edgecolor': FAINT, 'axes.linewidth': 0.8,
@@ -98,5 +98,5 @@ def decade(value: float) -> str:
 def axis_legend(axes: Any, where: str = 'upper right', **more: Any) -> None:
     """Draw the legend of the three sensor axes."""
     from matplotlib.lines import Line2D
-    axes.legend(handles=[Line2D([], [], color=colour, marker='o', markersize=4, lw=0, label=name) for name, colour in AXIS.items()],
-                loc=where, ncols=3, columnspacing=1.0, handletextpad=0.2, **more)
+    handles = [Line2D([], [], color=colour, marker=MARKER[name], markersize=4, lw=0, label=name) for name, colour in AXIS.items()]
+    axes.legend(handles=handles, loc=where, ncols=3, columnspacing=1.0, handletextpad=0.2, **more)

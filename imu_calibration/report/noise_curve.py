@@ -8,7 +8,7 @@ from imu_calibration.allan.processes import FLATNESS, FLICKER, RANDOM_WALK, WHIT
 from imu_calibration.allan.terms import predicted
 from imu_calibration.effects.base import SENSORS, UNIT
 from imu_calibration.report.drawn import Drawn
-from imu_calibration.report.figures import AXIS, FAINT, GREY, draw, log_axis
+from imu_calibration.report.figures import AXIS, FAINT, GREY, MARKER, draw, log_axis
 from imu_calibration.units import NOISE, for_people
 
 
@@ -29,22 +29,22 @@ class _Curves:
         log_axis(axes.xaxis)
         log_axis(axes.yaxis)
         first = 3 * SENSORS.index(self.sensor)
-        for k, colour in zip(range(first, first + 3), AXIS.values()):
-            self._axis(axes, tau, k, colour)
+        for k, name in zip(range(first, first + 3), AXIS):
+            self._axis(axes, tau, k, name)
         axes.set_ylim(*self._limits(first))
         self._slopes(axes, tau, max(range(first, first + 3), key=lambda k: self.result.axes[k].terms[WHITE.name].interval[1]))
         axes.set_xlabel('averaging time τ, s')
         axes.set_ylabel(f'Allan deviation, {self.unit}')
         self._legend(axes)
 
-    def _axis(self, axes, tau, k, colour):
+    def _axis(self, axes, tau, k, name):
         """Draw one axis: measured, band, model, and the curve with its trends."""
-        curve = self.result.record.curve
+        curve, colour = self.result.record.curve, AXIS[name]
         measured, raw = (np.sqrt(values[:, k]) * self.factor for values in (curve.variance, curve.raw))
         model, freedom = predicted(self.result.record.moments[k], self.result.axes[k])
         lower, upper = (measured * np.sqrt(freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))
         axes.fill_between(tau, lower, upper, color=colour, alpha=0.13, lw=0)
-        axes.plot(tau, measured, 'o', color=colour, markersize=3.2, zorder=3)
+        axes.plot(tau, measured, MARKER[name], color=colour, markersize=3.2, zorder=3)
         axes.plot(tau, np.sqrt(model) * self.factor, color=colour, lw=1.3, zorder=2)
         if self.result.record.trends[k]:
             axes.plot(tau, raw, ':', color=colour, lw=1.1)
@@ -75,7 +75,7 @@ class _Curves:
 
     def _legend(self, axes):
         from matplotlib.lines import Line2D
-        handles = [Line2D([], [], color=colour, marker='o', markersize=4, lw=1.3, label=name) for name, colour in AXIS.items()]
+        handles = [Line2D([], [], color=colour, marker=MARKER[name], markersize=4, lw=1.3, label=name) for name, colour in AXIS.items()]
         if any(self.result.record.trends[3 * SENSORS.index(self.sensor) + k] for k in range(3)):
             handles.append(Line2D([], [], color=GREY, ls=':', label='with its trends'))
         axes.legend(handles=handles, loc='upper right', ncols=len(handles))

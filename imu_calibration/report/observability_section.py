@@ -27,10 +27,9 @@ def observability_section(result: CalibrationResult) -> dict[str, Any]:
     return {**figures, 'directions': directions(calibration), 'strongest': strongest(calibration, live)}
 
 
-def directions(calibration: Calibration) -> list[dict[str, Any]]:
-    """Return the weak directions as rows: members with weights, and the motion that is needed."""
-    return [{'members': [(name, text(weight, 2)) for name, weight in d['parameters'].items()], 'needs': d['needs']}
-            for d in calibration.undetermined]
+def directions(calibration: Calibration) -> list[list[tuple[str, str]]]:
+    """Return the weak directions: (parameter, weight) of each."""
+    return [[(name, text(weight, 2)) for name, weight in d['parameters'].items()] for d in calibration.undetermined]
 
 
 def strongest(calibration: Calibration, live: np.ndarray, count: int = 5) -> list[tuple[str, str, str]]:

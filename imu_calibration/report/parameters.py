@@ -20,13 +20,12 @@ REPLACED = 'fixed at its prior: the estimate is weak and within one sd of it, so
 
 def parameter_groups(result: CalibrationResult | DiagnosisResult) -> list[dict[str, Any]]:
     """Return the table: groups with title, explanation and rows."""
-    calibration, needs = result.calibration, motions_needed(result)
-    groups = []
+    calibration, groups = result.calibration, []
     for effect in calibration.model.effects:
         part = calibration.model.slices[effect.key]
         rows = [_row(calibration.param_names[index], effect.components[k], calibration.values[index], sd=calibration.own_sd[index],
                      tolerance=result.tolerances[index], unit=effect.unit_of(k), status=calibration.status[index],
-                     why=_why(calibration, index, calibration.own_sd[index] / result.tolerances[index], needs))
+                     why=_why(calibration, index, calibration.own_sd[index] / result.tolerances[index]))
                 for k, index in enumerate(range(part.start, part.stop))]
         groups.append({'sensor': SENSOR_TITLES[effect.section], 'title': effect.heading, 'name': effect.name,
                        'explanation': effect.explanation, 'use': USE[effect.compensation], 'rows': rows, 'unit': effect.unit_of(0)})
@@ -57,25 +56,12 @@ def _bar(share):
     return round(float(np.clip((np.log10(max(share, 1e-9)) + 3) / 4, 0.02, 1.0)) * 100, 1)
 
 
-def _why(calibration, index, share, needs):
+def _why(calibration, index, share):
     status, name = calibration.status[index], calibration.param_names[index]
     if status == FIXED:
         return 'fixed by the choice of axes'
     if status == DETERMINED:
         return ''
-    motion = needs.get(name, '')
-    wanted = f'; needs: {motion}' if motion else ''
     if status == HELD:
-        return (REPLACED if calibration.held_reason.get(name) == REPLACEMENT else UNSEEN) + wanted
-    return f'estimated, but its sd is {text(share, 2)} times the tolerance' + wanted
-
-
-def motions_needed(result: CalibrationResult | DiagnosisResult) -> dict[str, str]:
-    """Return parameter name -> the motion that would serve it best, for all that are not determined."""
-    return {name: motion if not np.isfinite(sd)
-            else f'{motion} (one minute of it would bring the sd to {text(sd / _tolerance(result, name), 2)} of the tolerance)'
-            for name, (motion, sd) in result.needed.items()}
-
-
-def _tolerance(result, name):
-    return result.tolerances[result.calibration.param_names.index(name)]
+        return REPLACED if calibration.held_reason.get(name) == REPLACEMENT else UNSEEN
+    return f'estimated, but its sd is {text(share, 2)} times the tolerance'

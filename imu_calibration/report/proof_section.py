@@ -1,6 +1,6 @@
 """The proof in numbers: errors on held-out data, by sensor and regime."""
 
-from imu_calibration.calibration.decision import harmed
+from imu_calibration.calibration.decision import harmed, ratio_text
 from imu_calibration.calibration.document import Calibration
 from imu_calibration.units import error_text
 
@@ -12,8 +12,7 @@ def proof_section(calibration: Calibration) -> list[dict[str, str | bool]]:
         worse = harmed(found)
         for motion, part in (('all', found), *(found.get('regimes') or {}).items()):
             before, after = (error_text(part[name], part.get('unit', found['unit'])) for name in ('before', 'after'))
-            low, high = part['ci95']
             much = f'{part["seconds"]:.0f} s' if 'seconds' in part else f'{found["windows"]}'
             rows.append({'sensor': sensor, 'motion': motion, 'much': much, 'before': before, 'after': after,
-                         'ratio': f'{low:.2f} to {high:.2f}', 'bad': motion in worse})
+                         'ratio': ratio_text(part), 'bad': motion in worse})
     return rows

@@ -18,24 +18,22 @@ MOST_WINDOWS = 60
 KIND_TEXT = {'means': 'window means', 'static': 'at rest', 'spin': 'within spins', 'dynamic': 'within dynamic stretches'}
 
 
-def residual_section(result: CalibrationResult, errors: WindowErrors) -> dict[str, Any]:
+def residual_section(result: CalibrationResult) -> dict[str, Any]:
     """Return figures and tables of the residuals."""
-    figures = {sensor: draw_windows(errors, sensor) for sensor in SENSORS}
     traces = autocorrelation(result)
     lags = draw('autocorrelation', (8.6, 2.7), _Lags(traces),
                 label='Autocorrelation of the residuals within moving windows') if traces else None
-    return {'windows': figures, 'autocorrelation': lags, 'noise': noise_rows(result.calibration), 'chi2': chi2_rows(result.calibration),
-            'errors': error_rows(errors)}
+    return {'autocorrelation': lags, 'noise': noise_rows(result.calibration), 'chi2': chi2_rows(result.calibration)}
 
 
 def draw_windows(errors: WindowErrors, sensor: str) -> Drawn:
-    """Return the errors of one sensor in every window, before and after, as SVG."""
-    label = f'Errors of the {sensor} in every window, before and after calibration'
-    return draw(f'residuals-{sensor}', (8.6, 4.4), _Windows(errors, sensor), label=label)
+    """Return the errors of raw and corrected readings of one sensor in every held-out window, as SVG."""
+    label = f'Errors of raw and corrected readings of the {sensor} in every held-out window'
+    return draw(f'residuals-{sensor}', (7.2, 3.6), _Windows(errors, sensor), label=label)
 
 
 class _Windows:
-    """Two panels over time: before, and after with the noise floor."""
+    """Two panels over time: raw, and corrected with the expected residual from noise."""
 
     def __init__(self, errors, sensor):
         self.errors, self.sensor = errors, sensor
@@ -49,8 +47,8 @@ class _Windows:
         order = np.argsort(errors.time)
         lower.fill_between(errors.time[order], -floor[order], floor[order], step='mid', color='#dfe5ec', lw=0, zorder=0.5)
         self._points(lower, errors.after[sensor] * factor)
-        upper.set_title(f'before: rms {text(errors.rms(sensor, "before") * factor)} {unit}')
-        lower.set_title(f'after: rms {text(errors.rms(sensor, "after") * factor)} {unit}; grey: two sd of the expected residual from noise')
+        upper.set_title(f'{sensor}, raw')
+        lower.set_title('corrected; grey: two sd of the noise')
         for axes in (upper, lower):
             axes.axhline(0, color=GREY, lw=0.6)
             axes.set_ylabel(unit)
@@ -58,11 +56,9 @@ class _Windows:
         axis_legend(upper, 'lower right', bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
 
     def _points(self, axes, values, hollow=False):
-        for kind in np.unique(self.errors.kind):
-            rows = self.errors.kind == kind
-            for column, colour in enumerate(AXIS.values()):
-                axes.plot(self.errors.time[rows], values[rows, column], MARKER.get(kind, 'o'), color=colour, markersize=3.8,
-                          mfc='none' if hollow else colour, mew=0.8, alpha=0.9, ls='none')
+        for (name, colour), column in zip(AXIS.items(), values.T):
+            axes.plot(self.errors.time, column, MARKER[name], color=colour, markersize=3.8, mfc='none' if hollow else colour, mew=0.8,
+                      alpha=0.9, label=name)
 
 
 def autocorrelation(result: CalibrationResult) -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
@@ -103,8 +99,8 @@ class _Lags:
         panels = figure.subplots(1, len(self.traces), sharey=True, squeeze=False)[0]
         for axes, (sensor, (lags, values, bound)) in zip(panels, self.traces.items()):
             axes.axhspan(-bound, bound, color='#dfe5ec', lw=0, zorder=0.5)
-            for column, colour in enumerate(AXIS.values()):
-                axes.plot(lags[1:], values[1:, column], color=colour, lw=1.0)
+            for (name, colour), column in zip(AXIS.items(), values[1:].T):
+                axes.plot(lags[1:], column, color=colour, lw=1.0, marker=MARKER[name], markersize=3, markevery=max(1, len(column) // 12))
             limit = max(0.15, 1.1 * float(np.max(np.abs(values[1:]))))
             axes.set_ylim(-limit, limit)
             axes.set_title(sensor)
@@ -134,12 +130,3 @@ def chi2_rows(calibration: Calibration) -> list[dict[str, Any]]:
     found = {sensor: calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {} for sensor in SENSORS}
     kinds = list(dict.fromkeys(kind for sensor in SENSORS for kind in found[sensor]))
     return [{'kind': KIND_TEXT.get(kind, kind), 'values': [text(found[sensor].get(kind)) for sensor in SENSORS]} for kind in kinds]
-
-
-def error_rows(errors: WindowErrors) -> list[dict[str, Any]]:
-    """Return rms errors of window means by kind, before and after."""
-    rows = []
-    for kind in dict.fromkeys(errors.kind.tolist()):
-        cells = [in_unit(errors.rms(sensor, which, kind), UNIT[sensor]) for sensor in SENSORS for which in ('before', 'after')]
-        rows.append({'kind': KIND_TEXT[kind].replace('within ', ''), 'count': int((errors.kind == kind).sum()), 'cells': cells})
-    return rows

@@ -13,7 +13,10 @@ from imu_calibration import navigation
 from imu_calibration.by_hand.workflow import calibrate_without_table
 from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.reference.table import Table
 from imu_calibration.report.calibration_page import calibration_report
 from imu_calibration.report.navigation_section import expected_growth, motion_growth, noise_densities
@@ -144,7 +147,24 @@ def test_windows_after_calibration_scatter_as_noise_alone_would(on_table, by_han
         for sensor in ('accelerometer', 'gyroscope'):
             ratio = np.sqrt(np.mean((errors.after[sensor] / errors.floor[sensor])**2))
             assert 0.3 < ratio < 1.3  # by hand two of three components of each pose are fitted
-            assert errors.rms(sensor, 'before') > 8 * errors.rms(sensor, 'after')
+            assert np.linalg.norm(errors.before[sensor]) > 8 * np.linalg.norm(errors.after[sensor])
+
+
+def test_errors_after_calibration_are_of_held_out_windows(on_table, by_hand):
+    """Errors with the parameters of all windows are smaller."""
+    for result in (on_table, by_hand):
+        errors, known = result.window_errors(), result.calibration
+        for sensor in ('accelerometer', 'gyroscope')[:2 if result is on_table else 1]:
+            inverse = np.linalg.inv(known.of(sensor, Role.LINEAR))
+            fitted = (_fitted(result, sensor) @ inverse.T) if result is on_table else \
+                result.hand.compensate(result.hand.poses.force, result.hand.poses.rate, result.hand.poses.time)[0] - errors.true[sensor]
+            assert 1.0 < np.linalg.norm(errors.after[sensor]) / np.linalg.norm(fitted) < 4.0
+
+
+def _fitted(result, sensor):
+    """Return the residuals of window means with the parameters of all windows."""
+    means = np.array([row.sensors[sensor].mean for row in restrict(result.gathered.accumulator, result.gathered_model, result.model).rows])
+    return means[:, -3:] - means[:, :-3] @ coefficients(result.model, sensor, result.solution.values)
 
 
 def test_readings_at_one_g_are_zhangs_tables(on_table):
