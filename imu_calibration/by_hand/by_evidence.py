@@ -2,17 +2,20 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from imu_calibration.by_hand.calibrate import HandCalibration, HandData, default_gyroscope, solve_by_hand
-from imu_calibration.by_hand.inquiry import POSES_LEAST, HandInvestigation, investigate_by_hand
 from imu_calibration.by_hand.options import HandOptions
 from imu_calibration.calibration.model_changes import ModelChanges
 from imu_calibration.calibration.plausibility import one_significant
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.estimation.covariance_terms import REJECTED, with_term
+
+if TYPE_CHECKING:
+    from imu_calibration.by_hand.inquiry import HandInvestigation
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +24,7 @@ class EvidentHand:
 
     hand: HandCalibration
     """The calibration."""
-    found: HandInvestigation | None = None
+    found: 'HandInvestigation | None' = None
     """Search result; None with too few poses, or without a search."""
     changes: ModelChanges = ModelChanges()
     """Changes of the requested model by the evidence."""
@@ -47,6 +50,7 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
         As `solve_by_hand`.
 
     """
+    from imu_calibration.by_hand.inquiry import POSES_LEAST, investigate_by_hand  # here, because its import is slow
     if as_asked or len(data.poses.start) < POSES_LEAST:
         return EvidentHand(solve_by_hand(data, options))
     found, asked = investigate_by_hand(data, options, progress), _asked(data, options)
@@ -77,7 +81,7 @@ def _faint(hand, found, asked):
     return faint
 
 
-def extended_by_hand(data: HandData, found: HandInvestigation, options: HandOptions) -> HandCalibration:
+def extended_by_hand(data: HandData, found: 'HandInvestigation', options: HandOptions) -> HandCalibration:
     """Return the calibration with the requested model and the findings; denied or implausible effects increase its covariance."""
     asked, names = _asked(data, options), found.names
     hand = solve_by_hand(data, replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS}), found.point())

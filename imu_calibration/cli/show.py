@@ -2,13 +2,15 @@
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from imu_calibration.calibration.document import HEADINGS, NUMBERS, parameter_rows
 from imu_calibration.calibration.result import summary
 from imu_calibration.errors import printable, with_hint
 from imu_calibration.preflight.evidence import CheckFinding, Severity
-from imu_calibration.use_cases.calibrate import Calibrated
+
+if TYPE_CHECKING:
+    from imu_calibration.use_cases.calibrate import Calibrated
 
 
 def console() -> Any:
@@ -69,7 +71,7 @@ def show_findings(out: Any, findings: tuple[CheckFinding, ...], hints: dict[str,
     out.print(table)
 
 
-def show_calibration(found: Calibrated, folder: Path, hints: dict[str, str], *, report: bool = True) -> None:
+def show_calibration(found: 'Calibrated', folder: Path, hints: dict[str, str], *, report: bool = True) -> None:
     """Print the parameters of a `Calibrated`, the decisions and where the files are."""
     out = console()
     show_table(out, HEADINGS, parameter_rows(found.calibration), numbers=NUMBERS)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from imu_calibration.preflight.evidence import REFUSE, CheckFinding
 from imu_calibration.preflight.exchanges import LEAST_SAMPLES, SAME, SURE, Exchange
@@ -179,6 +178,7 @@ def _correlations(first, second, most):
     size = 1 << int(np.ceil(np.log2(2 * len(first))))
     sums = np.fft.irfft((np.fft.rfft(first, size, axis=0) * np.conj(np.fft.rfft(second, size, axis=0))).sum(axis=1), size)
     shifts = np.arange(-most, most + 1)
+    from scipy.interpolate import CubicSpline  # here, because its import is slow
     return CubicSpline(shifts, sums[shifts])(np.arange(-most * RESOLVED, most * RESOLVED + 1) / RESOLVED)
 
 

@@ -29,6 +29,14 @@ def test_help_imports_no_heavy_module(verb):
     assert found <= HELP_NEEDS.get(verb, set())
 
 
+@pytest.mark.live
+def test_an_inspection_imports_neither_the_search_nor_slow_libraries():
+    program = ('import sys\nfrom imu_calibration.cli.main import main\nmain(sys.argv[1:])\nprint(*sys.modules, file=sys.stderr)')
+    done = subprocess.run([sys.executable, '-c', program, 'inspect', SESSION], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert not set(done.stderr.split()) & {'scipy.interpolate', 'scipy.optimize', 'scipy.stats', 'scipy.signal', 'matplotlib', 'rclpy', 'jinja2',
+                                           'imu_calibration.by_hand.inquiry', 'imu_calibration.use_cases.calibrate'}
+
+
 @pytest.mark.parametrize('verb', parser.VERBS)
 def test_help_fits_a_screen_and_has_two_examples(verb, capsys, monkeypatch):
     monkeypatch.setenv('COLUMNS', '80')
