@@ -10,6 +10,7 @@ from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.cli.main import main
 from imu_calibration.documents import to_text
 from imu_calibration.errors import InputError
+from imu_calibration.estimation.pieces import Regime
 from imu_calibration.reference.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.check import check
@@ -32,14 +33,14 @@ def calibrated(pair):
 
 def test_a_good_file_helps_in_another_session_of_its_imu(pair, calibrated):
     found = check(pair.second.block, calibrated.calibration, Table.from_mapping(pair.table))
-    assert found.helps and found.exit_code == 0 and str(found).startswith('the calibration helps\n')
+    assert found.helps and found.exit_code == 0
     assert all(part['after'] < 0.6 * part['before'] for entry in found.proof.values() for part in entry['regimes'].values())
 
 
 def test_a_file_of_another_imu_does_not_help(pair, calibrated):
     other = make_pair(None, 4)
     found = check(other.second.block, calibrated.calibration, Table.from_mapping(other.table))
-    assert not found.helps and found.exit_code == 3 and str(found).startswith('it helps no sensor\n')
+    assert not found.helps and found.exit_code == 3
 
 
 def test_a_bias_that_moved_is_named(pair, calibrated):
@@ -71,12 +72,11 @@ def test_the_verb_prints_errors_and_answers_with_its_exit_code(capsys, tmp_path,
     (tmp_path / 'calibration.yaml').write_text(calibration_to_text(calibrated.calibration))
     assert main(['check', bag, '--calibration', file, '--table', table]) == 0
     out = capsys.readouterr().out
-    assert 'fast turns' in out and 'the calibration helps' in out
+    assert Regime.FAST in out
     spoiled = calibrated.calibration.values.copy()
     spoiled[calibrated.calibration.param_names.index('gyroscope.matrix.zz')] *= 1.5
     (tmp_path / 'calibration.yaml').write_text(calibration_to_text(replace(calibrated.calibration, values=spoiled)))
     assert main(['check', bag, '--calibration', file, '--table', table]) == 3
-    assert 'it helps the accelerometer only' in capsys.readouterr().out
 
 
 def test_an_earlier_calibration_is_proven_beside_a_new_one(pair, calibrated):
@@ -85,6 +85,6 @@ def test_an_earlier_calibration_is_proven_beside_a_new_one(pair, calibrated):
     earlier = replace(calibrated.calibration, values=spoiled)
     found = calibrate(pair.second.block, Table.from_mapping(pair.table), model_as_asked=True, earlier=earlier)
     entry = found.calibration.proof['gyroscope']
-    assert entry['earlier']['after'] > 3 * entry['after'] and 'with the earlier calibration' in str(found)
+    assert entry['earlier']['after'] > 3 * entry['after']
     with refused(InputError, 'table_missing'):
         calibrate(pair.second.block, earlier=earlier)

@@ -109,7 +109,7 @@ def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result):
 
 def test_gravity_sd_of_the_table_description_is_used(result):
     stated = replace(result, table=replace(result.table, gravity_sd=1e-3))
-    assert 'to 0.001' in error_budget(stated).texts['gravity']
+    assert '0.001' in error_budget(stated).texts['gravity']
 
 
 def test_normal_gravity_of_a_latitude_has_the_accuracy_of_its_formula(recording, result):

@@ -1,6 +1,8 @@
 """A calibration is proven on windows that took no part, before it is handed over."""
 
 
+import re
+
 import numpy as np
 import pytest
 
@@ -53,7 +55,6 @@ def test_a_good_calibration_is_proven_in_every_motion(clean):
         assert set(entry['regimes']) >= {Regime.REST, Regime.FAST, Regime.ACCELERATING}
         for part in (entry, *entry['regimes'].values()):
             assert part['ci95'][0] <= part['after'] / part['before'] <= part['ci95'][1] < 0.6
-    assert 'on held-out data' in str(clean)
 
 
 def test_a_gain_that_a_lag_has_spoiled_is_no_help_and_the_cause_is_named(late, tmp_path):
@@ -63,7 +64,7 @@ def test_a_gain_that_a_lag_has_spoiled_is_no_help_and_the_cause_is_named(late, t
     assert late.verdict.decisions['gyroscope'] is not HELPS and late.exit_code == 3
     assert late.calibration.proof['gyroscope']['delay_s'] == pytest.approx(0.012, abs=2e-3)
     line = reason_of(late.calibration.proof['gyroscope'])
-    assert 'ms late' in line and '\n' not in line and line == late.calibration.decision_reasons['gyroscope']
+    assert re.search(r'\b1\d(\.\d+)? ms\b', line) and '\n' not in line and line == late.calibration.decision_reasons['gyroscope']
     assert late.verdict.decisions['accelerometer'] is HELPS   # its residuals are large, and it helps in every motion
     late.save(tmp_path, report=False)
     assert 'proof:' in (tmp_path / 'calibration.yaml').read_text()
@@ -105,9 +106,9 @@ def test_memory_does_not_grow_with_the_session(clean):
 def test_a_regime_that_gets_worse_is_named(clean):
     entry = clean.calibration.proof['gyroscope']
     worse = {'before': 1.0, 'after': 1.2, 'ci95': [1.1, 1.3], 'seconds': 10.0}
-    lines = worse_regimes(entry | {'regimes': entry['regimes'] | {'fast turns': worse}})
-    assert len(lines) == 1 and 'fast turns' in lines[0]
-    assert not worse_regimes(entry | {'regimes': {'fast turns': worse | {'ci95': [0.9, 1.5]}}})
+    lines = worse_regimes(entry | {'regimes': entry['regimes'] | {Regime.FAST: worse}})
+    assert len(lines) == 1 and Regime.FAST in lines[0]
+    assert not worse_regimes(entry | {'regimes': {Regime.FAST: worse | {'ci95': [0.9, 1.5]}}})
 
 
 def test_a_piece_knows_its_mean_and_how_the_input_changed():

@@ -42,7 +42,7 @@ def test_nested_powers_in_a_calibration_are_refused_before_they_are_multiplied_o
     """29 kB took all memory: each level of abs(...)**9 multiplies the text of the compensation by nine."""
     (tmp_path / 'calibration.yaml').write_text(hostile_calibration())
     ended = refused('compensate', bag, '--calibration', tmp_path / 'calibration.yaml', '--output', tmp_path / 'corrected')
-    assert 'multiplied out' in ended.err and not (tmp_path / 'corrected').exists()
+    assert '5000' in ended.err and not (tmp_path / 'corrected').exists()
 
 
 # Places
@@ -51,7 +51,7 @@ def test_a_pipe_as_calibration_is_refused_and_not_waited_for(tmp_path, bag):
     os.mkfifo(tmp_path / 'calibration.yaml')
     for path in (tmp_path / 'calibration.yaml', '/dev/zero'):
         ended = refused('compensate', bag, '--calibration', path, '--output', tmp_path / 'corrected')
-        assert 'regular file' in ended.err
+        assert str(path) in ended.err and not (tmp_path / 'corrected').exists()
 
 
 def test_a_saved_session_that_grows_a_thousandfold_is_refused():
@@ -85,7 +85,7 @@ def _refusal(load, names):
     try:
         load(target.getvalue())
     except DocumentError as error:
-        return 'refused' if 'are accepted' in str(error) else str(error)
+        return 'refused' if re.findall(r'\d{6,}', str(error)) else str(error)   # bytes that are needed, bytes that are accepted
 
 
 @pytest.mark.parametrize('damage', [b'', b'PK', b'(' * 5000])

@@ -90,7 +90,6 @@ def test_without_rest_large_residuals_leave_it_unproven():
     base = replace(with_statistics('gyroscope', chi2_per_dof={'spin': 20.0}), proof=PROOF)
     restless = replace(base, statistics=base.statistics | {'windows': {'spin': 3}})
     assert judge(base, TOLERANCES).word is HELPS and judge(restless, TOLERANCES).decisions == {'accelerometer': HELPS, 'gyroscope': UNPROVEN}
-    assert any('times their slow part' in line for line in judge(restless, TOLERANCES).lines())
     assert judged(restless, TOLERANCES).decisions['gyroscope'] is UNPROVEN and 'period' in judged(restless, TOLERANCES).decision_reasons['gyroscope']
 
 

@@ -242,7 +242,7 @@ def test_members_that_never_end_or_come_again_are_left_out(bag, tmp_path):
     os.mkfifo(bag / 'more.db3')
     os.symlink('/dev/zero', bag / 'more.db3.zstd')
     ended = survived('inspect', bag)
-    assert 'not a regular file' in ended.out + ended.err
+    assert all(name in ended.out + ended.err for name in ('more.mcap', 'more.db3'))
     for name in ('fifo.mcap', 'fifo.bag', 'fifo.csv'):
         os.mkfifo(tmp_path / name)
         refused('inspect', tmp_path / name)

@@ -51,18 +51,18 @@ def joints(block, names=None, sign=1.0):
 
 
 @pytest.mark.parametrize(('change', 'words'), [
-    (still, ('this IMU does not turn when the table does', 'give the topic')),
-    (lambda block: joints(block, ('middle', 'outer', 'inner')), ('outer turns as middle should', 'middle turns as outer should')),
-    (lambda block: joints(block, sign=-1.0), ('outer turns the other way round', 'inner turns the other way round')),
-    (lambda block: later(block, 2.0), ('about 2.0 s behind those of the joints', 'set both clocks by one source')),
-    (lambda block: later(block, 9.0), ('its motion is not that of the table', 'both clocks')),
+    (still, ()),
+    (lambda block: joints(block, ('middle', 'outer', 'inner')), ('outer', 'middle')),
+    (lambda block: joints(block, sign=-1.0), ('outer', 'inner')),
+    (lambda block: later(block, 2.0), ('2.0 s',)),
+    (lambda block: later(block, 9.0), ()),
 ], ids=('another IMU', 'exchanged joints', 'wrong signs', 'apart in time', 'farther apart than is looked for'))
 def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(gimbals, change, words):
     block, table = gimbals
-    with pytest.raises(InputError) as caught:
+    with refused(InputError, 'on_table') as caught:
         calibrate(change(block), table)
     assert all(word in str(caught.value) for word in words) and '\n' not in str(caught.value)
-    assert ('--imu-topic' in caught.value.told({'imu_topic': '--imu-topic'})) == ('give the topic' in str(caught.value))
+    assert ('--imu-topic' in caught.value.told({'imu_topic': '--imu-topic'})) == (not words)   # no joint and no delay explains it
 
 
 @pytest.mark.parametrize(('seconds', 'delay', 'side'), [(0.5, '0.5 s', 'behind'), (-0.5, '0.5 s', 'ahead'), (2.0, '2.0 s', 'behind')])
@@ -117,7 +117,7 @@ def test_a_real_delay_of_fast_sweeps_is_reported(shaft, delay):
     def rate(time):
         return (1.0 + 0.5 * np.sin(0.77 * time)) * ripple(time)
     found = _a_period_late([sweeps(table, lambda time: rate(time - delay), rate)], table)
-    assert found is not None and f'about {abs(delay):.1f} s {"behind" if delay > 0 else "ahead"}' in found.text
+    assert found is not None and f' {abs(delay):.1f} s ' in found.text and ('behind' if delay > 0 else 'ahead') in found.text
 
 
 @pytest.mark.parametrize('swing', [0.0, 0.6])
@@ -136,7 +136,7 @@ def test_half_a_period_of_delay_is_told_from_a_wrong_sign_as_far_as_sweeps_diffe
     if swing and sign < 0:
         assert found is None
     else:
-        assert found.sure == (swing > 0) and 'about 1.0 s' in found.words
+        assert found.sure == (swing > 0) and ' 1.0 s' in found.words
 
 
 @pytest.mark.parametrize(('signs', 'corrected'), [((-1, 1, 1), ['outer']), ((1, -1, 1), ['middle']), ((1, 1, -1), ['inner']),
@@ -145,7 +145,7 @@ def test_the_joints_with_a_reversed_sign_are_named_and_no_mount_or_standstill_is
     """Signs of outer and inner together are a sensor turned about y for the gyroscope; gravity separates them."""
     with refused(InputError, 'on_table') as caught:
         calibrate(joints(gimbals[0], sign=np.array(signs)), gimbals[1])
-    assert [name for name in gimbals[1].joint_names if f'{name} turns the other way round' in str(caught.value)] == corrected
+    assert [name for name in gimbals[1].joint_names if re.search(rf'\b{name}\b', str(caught.value))] == corrected
 
 
 def test_a_reversed_joint_is_no_standstill_of_a_parallel_one(gimbals):
@@ -160,7 +160,7 @@ def test_a_reversed_joint_is_no_standstill_of_a_parallel_one(gimbals):
     assert standing_still([window], table).check == 'frozen', 'a standstill of inner explains it'
     told = reference_motion(table, reversed_outer).rate_s
     finding, = _rates((reference.rate_s.T @ told, told.T @ told, reference.rate_s.T @ reference.rate_s), [window], table)
-    assert finding.check == 'on_table' and 'outer turns the other way round' in finding.text
+    assert finding.check == 'on_table' and 'outer' in finding.text and 'middle' not in finding.text
 
 
 @pytest.mark.parametrize(('order', 'signs', 'words'), [([1, 0, 2], [1, 1, -1], "measured x is the reference's y"),

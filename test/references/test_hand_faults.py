@@ -1,5 +1,6 @@
 """Recordings by hand as they really are: wrong full-scale settings, clipped turns, late stamps, slow turns, warm-up, creeping poses."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -74,7 +75,7 @@ def test_a_right_full_scale_stays_one(session):
 @pytest.mark.parametrize('factor', [2.0, 0.5, 4.0])
 def test_preflight_names_the_full_scale_factor(session, factor):
     found, = (f for f in looked_at(with_wrong_full_scale(session[0], factor)) if f.check == 'full_scale')
-    assert found.severity == 'warning' and f'are {factor:g} times' in found.text and 'full-scale range' in found.text
+    assert found.severity == 'warning' and f' {factor:g} ' in found.text
     assert not [f for f in looked_at(session[0]) if f.check == 'full_scale' and f.severity != 'good']
 
 
@@ -173,7 +174,7 @@ def test_biases_that_drift_carry_it_in_their_sd_and_a_note_with_its_size():
     assert still.statistics['bias_moved'] == {}
     assert found.statistics['bias_moved'] == {'accelerometer': pytest.approx(0.0981, rel=0.15), 'gyroscope': pytest.approx(0.004, rel=0.15)}
     first, = (note.text for note in notes(found.statistics['bias_moved'], 600.0) if note.text.startswith('accelerometer'))
-    assert 'accelerometer bias moved by' in first and 'mg in 10 minutes' in first
+    assert re.search(r'\b(9|1\d)(\.\d+)? mg\b', first) and ' 10 ' in first
     for name, change in (('accelerometer.bias.x', 0.0981), ('gyroscope.bias.x', 0.004)):
         middle = truth[PARAM_NAMES.index(name)] + change / 2
         assert abs(found.value(name) - middle) < 0.1 * change and found.sd_of(name) > 0.4 * change

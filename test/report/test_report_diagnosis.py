@@ -118,7 +118,8 @@ def of_formula(result):
 
 def test_the_headline_of_a_formula_states_its_share(of_formula):
     page = diagnosis_report(of_formula)
-    assert '<p class="word">A formula explains 96 % of the gyroscope residual</p>' in page
+    headline = page.partition('<p class="word">')[2].partition('</p>')[0]
+    assert '96 %' in headline and 'gyroscope' in headline
     assert 'section id="formulas"' in page and page.lower().count('turn about two axes') == 1   # advice once
     assert not any('nothing found' in line for line in of_formula.lines)
 
@@ -128,8 +129,7 @@ def test_the_gain_of_a_formula_is_in_the_unit_of_the_sensor(of_formula):
     gain = of_formula.document['unexplained']['gyroscope']['proposals'][0]['gain']
     assert gain['heldout_rms_before'] == 5e-4 and gain['heldout_rms_after'] == pytest.approx(5e-4 * 0.2, rel=1e-12)
     assert gain['ci95'] == pytest.approx([0.7, 0.9], rel=1e-12) and gain['windows'] == of_formula.diagnosis.locked
-    line = next(line for line in of_formula.lines if 'gain of the formula' in line)
-    assert '0.0286 deg/s before, 0.00286 deg/s to 0.00859 deg/s after' in line
+    assert any(all(size in line for size in ('0.0286 deg/s', '0.00286 deg/s', '0.00859 deg/s')) for line in of_formula.lines)
 
 
 def test_the_distance_agrees_with_the_held_out_gain(result):

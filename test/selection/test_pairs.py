@@ -63,14 +63,9 @@ def outcome(search, named, rest):
     return SimpleNamespace(attempt=attempt, chosen=named, named=named, rest=rest)
 
 
-@pytest.mark.parametrize(('rest', 'found'), ((0.0, set()), (50.0, set(NAMES[:2]))))
-def test_pairs_are_asked_where_a_rest_stays(monkeypatch, rest, found):
+@pytest.mark.parametrize(('rest', 'remaining', 'found'), ((0.0, -1.0, set()), (50.0, -1.0, set(NAMES[:2])), (50.0, 10.0, set())),
+                         ids=('nothing to explain', 'a pair explains it', 'a pair leaves a fifth'))
+def test_pairs_are_tested_for_a_remaining_excess(monkeypatch, rest, remaining, found):
     search = searched((1.0, 0.6, -0.6, 0.0, 0.0), 0.95)
-    monkeypatch.setattr(investigation, '_settled', lambda attempted, attempt, chosen: outcome(search, chosen, -1.0))
+    monkeypatch.setattr(investigation, '_settled', lambda attempted, attempt, chosen: outcome(search, chosen, remaining))
     assert names(investigation._looked_again(outcome(search, [], rest), None, False).named) == found
-
-
-def test_what_leaves_a_fifth_is_not_taken(monkeypatch):
-    search = searched((1.0, 0.6, -0.6, 0.0, 0.0), 0.95)
-    monkeypatch.setattr(investigation, '_settled', lambda attempted, attempt, chosen: outcome(search, chosen, 10.0))
-    assert not investigation._looked_again(outcome(search, [], 50.0), None, False).named
