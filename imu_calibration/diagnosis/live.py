@@ -68,9 +68,10 @@ class DiagnosisQuestion:
     snapshot: LiveSnapshot
     """Data of a solution."""
 
-    def is_the_same_as(self, other: 'DiagnosisQuestion') -> bool:
-        """Return whether another question is about the same samples."""
-        return self.snapshot.gathered.accumulator.samples == other.snapshot.gathered.accumulator.samples
+    @property
+    def samples(self) -> dict:
+        """Numbers of samples: equal for two questions about the same ones."""
+        return self.snapshot.gathered.accumulator.samples
 
     def answer(self, progress: Callable[[float], object] | None = None) -> Answer:
         """Diagnose and return the `Answer`; `progress` is called with the share done and may raise to end it."""

@@ -33,7 +33,7 @@ class DiagnosisThread:
         self._next, self._wanted, self._urgent = time.monotonic() + period, False, False
         self.state = DiagnosisState() if period else DiagnosisState(OFF, OFF_WHY)
         self.n_answers, self._session = 0, 0
-        self._answered: DiagnosisQuestion | None = None
+        self._answered: dict | None = None   # numbers of samples of the last question; the question itself keeps all windows in memory
         self._demand: Demand | None = None
 
     def change(self, period: float) -> None:
@@ -78,7 +78,7 @@ class DiagnosisThread:
         except Exception as error:   # a diagnosis that fails must not end the calibration
             answer = Answer(DiagnosisState(FAILED, f'the diagnosis failed: {type(error).__name__}: {error}'))
         if session == self._session:
-            self.state, self._demand, self._answered, self.n_answers = answer.state, answer.demand, question, self.n_answers + 1
+            self.state, self._demand, self._answered, self.n_answers = answer.state, answer.demand, question.samples, self.n_answers + 1
         del answer
         return_freed_memory()
         end = time.monotonic()
@@ -93,7 +93,7 @@ class DiagnosisThread:
     def settle(self, question: DiagnosisQuestion | None) -> None:
         """Run a diagnosis and wait for it; one of the same windows that was completed already is not repeated."""
         self._join()
-        if question is not None and self.period and not (self._answered and question.is_the_same_as(self._answered)):
+        if question is not None and self.period and question.samples != self._answered:
             self._urgent = True
             self.ask_when_due(lambda: question, True)
             self._join()
