@@ -74,7 +74,7 @@ def _faint(hand, found, asked):
     faint = []
     for question in found.adopted:
         effect, part = question.effect, hand.model.parts[question.effect.key]
-        at = np.arange(part.start, part.stop - effect.time_constant)
+        at = np.arange(part.start, part.start + effect.n_amplitudes)
         values, sd = hand.state.values[at], np.array([hand.sd_of(hand.model.param_names[k]) for k in at])
         if question.name not in asked[question.sensor] and (effect.surpasses(values) or not one_significant(values, sd)):
             faint.append(question)

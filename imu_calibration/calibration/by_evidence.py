@@ -214,7 +214,7 @@ def stands_out(solution: Solution, question: Question) -> bool:
     Its size is plausible, by the threshold that the verdict uses; it differs from its prior significantly, and so does one coefficient.
     """
     effect, part = question.effect, solution.model.slices[question.sensor, question.name]
-    at = np.arange(part.start, part.stop - effect.time_constant)
+    at = np.arange(part.start, part.start + effect.n_amplitudes)
     if effect.surpasses(solution.values[at]):
         return False
     at = at[~solution.held[at]]

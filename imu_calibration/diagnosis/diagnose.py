@@ -110,7 +110,8 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
     return Diagnosis(tuple(findings), rests, candidates_of(attempt.search, named, agree=attempt.windows_agree),
                      tuple(found.not_testable),
-                     baseline, solution, heldout_gain(attempt, [], named, sensors=sensors), len(found.used), int(np.sum(attempt.locked)))
+                     baseline, solution, heldout_gain(attempt, [], named, sensors=sensors), len(found.used), int(np.sum(attempt.locked)),
+                     onset=found.onset)
 
 
 def _rivals(found, question):

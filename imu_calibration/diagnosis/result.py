@@ -95,6 +95,8 @@ class Diagnosis:
     """Windows held out from the choice of effects."""
     traces: Any = None
     """`traces.Traces`: residuals before and after, for plots; None during a live session."""
+    onset: Any = None
+    """Parameters that change at one moment (`selection.onset.Onset`), or None; the findings are those of the longer part."""
 
     @property
     def model(self) -> SensorModel:
@@ -131,6 +133,7 @@ def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
     return _plain({
         'format': FORMAT,
         'baseline': {sensor: _baseline(diagnosis.baseline, sensor) for sensor in SENSORS},
+        'onset': None if diagnosis.onset is None else diagnosis.onset.to_mapping(),
         'findings': [_finding(finding) for finding in diagnosis.findings],
         'gain': _gain(diagnosis.gain) if diagnosis.findings else None,
         'dead_reckoning': diagnosis.traces.dead_reckoning,

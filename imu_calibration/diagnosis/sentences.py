@@ -44,8 +44,9 @@ def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], ga
     if n_clipped is not None:
         limit = _with_unit(f'{value * factor:.4g}', unit)
         return f'{effect.explanation} The limit is {limit}; {n_clipped} samples at it and neighbouring samples were excluded.'
-    which = '' if len(values) == 1 else f' (largest: {label})'
-    text = f'{effect.explanation} Its size is {size}{which}.'
+    which = '' if len(amplitudes) == 1 else f' (largest: {label})'
+    when = f' at {values[-1][1]:.1f} s' if effect.located else ''
+    text = f'{effect.explanation} Its size is {size}{which}{when}.'
     if gain is not None and gain.reduction > 0:
         text += f' With it the {gain.sensor} residual of held-out {gain.measure} falls by {_percent(gain.reduction)}.'
     return text

@@ -26,8 +26,11 @@ from imu_calibration.effects.sensor_model import BARE
 from imu_calibration.preflight.checks import Preflight
 from imu_calibration.reference.table import Table
 from imu_calibration.selection.investigation import too_few_windows
+from imu_calibration.selection.onset import Onset
 from imu_calibration.units import error_text
 
+MOST_SHOWN = 3
+"""Parameters of a change that are printed."""
 MUCH = 100.0
 """Held-out gain of log likelihood from which a refused effect is reported, nats."""
 WHY_NOT = {LEAVES_MOST: 'most of the unexplained residual remains with it, so that both may have another cause',
@@ -185,7 +188,7 @@ def _percent(advance):
 
 def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     """Return the findings, the unexplained residual of each sensor and the effects without a test, as lines."""
-    lines = []
+    lines = onset_lines(diagnosis.onset)
     for number, finding in enumerate(diagnosis.findings, 1):
         lines.append(f'{number}. {finding.title}: {finding.explanation}')
         if finding.indistinguishable_from:
@@ -202,6 +205,18 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.not_testable:
         lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
     return lines
+
+
+def onset_lines(onset: Onset | None) -> list[str]:
+    """Return the moment at which parameters change, with their values before and after, as lines."""
+    if onset is None:
+        return []
+    largest = sorted(onset.before, key=lambda name: -abs(onset.after[name] - onset.before[name]))[:MOST_SHOWN]
+    states = [[in_words(state[name], onset.what, onset.units[name]).removesuffix(' 1') for state in (onset.before, onset.after)]
+              for name in largest]
+    values = '; '.join(f'{name} {before} before, {after} after' for name, (before, after) in zip(largest, states))
+    return [f'change at {onset.time:.1f} s of {onset.what}: {values}',
+            f'   it explains {100 * onset.share:.0f} % of the residual; other results: of the longer part; record again without the change']
 
 
 def beyond_lines(sensor: str, rest: Unexplained) -> list[str]:

@@ -113,6 +113,10 @@ class Effect:
     """Plausible size by grade: (grade, largest, source), in `unit`."""
     time_constant: bool = False
     """Whether the last component is a time constant, s, on which the columns depend, and all preceding ones are amplitudes."""
+    located: bool = False
+    """Whether the last component is the time of a step, s: a search estimates it, least squares does not."""
+    sudden: bool = False
+    """Whether its value may change at one moment."""
     nonnegative: bool = False
     """Whether the values cannot be negative, e.g. lags."""
     smooth: bool = False
@@ -157,6 +161,11 @@ class Effect:
         return tuple(group for group, own in zip(self.groups, self.group_sensors) if own == sensor) if self.group_sensors else self.groups
 
     @property
+    def n_amplitudes(self) -> int:
+        """Number of components without the time constant or the time of a step."""
+        return self.size - (self.time_constant or self.located)
+
+    @property
     def relinearised(self) -> bool:
         """Whether its columns depend on its own value."""
         return self.warp is not None or self.time_constant
@@ -184,8 +193,8 @@ class Effect:
         return np.full(self.size, self.prior_sd, float)
 
     def amplitudes(self, values: Any) -> Any:
-        """Return the values without the time constant."""
-        return values[:-1] if self.time_constant else values
+        """Return the values without the time constant or the time of a step."""
+        return values[:self.n_amplitudes]
 
     def at_time_constant(self, constant: float) -> np.ndarray:
         """Return the prior values with another time constant, shape (size,): a point of linearisation of a bank."""

@@ -133,6 +133,9 @@ def _steps(effect, at, forward):
     """
     for index in range(effect.size):
         step = np.zeros(effect.size)
+        if index == effect.n_amplitudes and effect.located:
+            yield at, at, 1.0   # least squares does not move the time of a step
+            continue
         step[index] = effect.step
         below = at if forward else at - step
         if effect.nonnegative:

@@ -76,7 +76,7 @@ First-order filter, pure delay and second-order filter of each sensor; collinear
 
 CLOCK = 'time_offset'
 """Common lag of both sensors: an offset of the clocks."""
-CLOCKS = frozenset({'clock_rate'})
+CLOCKS = frozenset({'clock_rate', 'clock_step'})
 """Lags of both sensors that change with time."""
 FAMILY = frozenset({CLOCK, *(effect.name for effect in LAGS)})
 """Effects with one first derivative."""

@@ -83,6 +83,10 @@ def _late_with_time(table, motion, values):
     return [(1.0, table, shifted(motion, values[0] * motion.time))]
 
 
+def _late_after(table, motion, values):
+    return [(1.0, table, shifted(motion, values[0] * (motion.time >= values[1])))]
+
+
 def _earth(values, point):
     """Coefficients of the attitude columns: matrix_ij C_jk earth_k."""
     matrix = values['matrix'].reshape(3, 3)
@@ -124,7 +128,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
                                 'against': ('angle',)}
     return (
         Effect(
-            **of_table, name='table_tilt', role=Role.TILT, components=('x', 'y'), shape=(2,),
+            **of_table, name='table_tilt', sudden=True, role=Role.TILT, components=('x', 'y'), shape=(2,),
             explanation='The table is not level: its vertical is rotated by a small angle about the base axes.',
             tolerance_reason='0.1 mg at 1 g, a tenth of the accelerometer bias', prior_sd=2e-3,
             plausible=(('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),), motion=('turn_about_vertical',),
@@ -136,7 +140,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             plausible=(('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),),
             motion=('two_axis', 'static_dense'), warp=_axes, needs=('joints', 'two_joints')),
         Effect(
-            **of_table, name='encoder_zero', components=names.zeros, shape=(len(names.zeros),),
+            **of_table, name='encoder_zero', sudden=True, components=names.zeros, shape=(len(names.zeros),),
             explanation='The zero of an inner joint angle differs from the table description.',
             tolerance_reason='as the tilt', prior_sd=names.angle_sd or 0.01,
             plausible=(('bench', 0.02, 'field catalogue 6.3: encoder zero, up to degrees'),),
@@ -176,7 +180,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             motion=('static_dense', 'two_axis'), groups=tuple(LOAD.values()), group_sensors=tuple(LOAD), coefficients=_bent,
             needs=('joints',)),
         Effect(
-            name='time_offset', sensor='reference', role=Role.DELAY, components=('offset',), shape=(), unit='s', nuisance=True,
+            name='time_offset', sudden=True, sensor='reference', role=Role.DELAY, components=('offset',), shape=(), unit='s', nuisance=True,
             explanation='The IMU stamps are late against the joint stamps.',
             tolerance=1e-4, tolerance_reason='0.1 mrad at 1 rad/s', prior_sd=0.1,
             plausible=(('bench', 0.05, 'field catalogue 6.3: 1-20 ms on serial paths'),),
@@ -187,6 +191,12 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             tolerance=1e-6, tolerance_reason='0.6 ms in 10 min', prior_sd=1e-3,
             plausible=(('bench', 5e-4, 'crystal oscillators: 10-100 ppm over temperature'),),
             motion=('oscillate_fast', 'two_axis'), compensation='none', warp=_late_with_time, needs=('joints', 'dynamic'), step=1e-6),
+        Effect(
+            name='clock_step', sensor='reference', components=('step', 'time'), shape=(2,), unit='s', nuisance=True, against=('time',),
+            explanation='The clock of the IMU stamps is set at one moment: the lag changes by a step.',
+            tolerance=1e-4, tolerance_reason='as the time offset', prior=(0.0, 60.0), prior_sd=(0.1, 1.0),
+            plausible=(('bench', 0.05, 'as the time offset'),), located=True,
+            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=_late_after, needs=('joints', 'dynamic'), step=2e-4),
         Effect(
             name='earth_rate', sensor='reference', components=('x', 'y', 'z'), shape=(3,), unit='rad/s', nuisance=True,
             title='Earth rate in the level frame', known_size=True, moot=_earth_known,

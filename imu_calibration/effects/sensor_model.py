@@ -194,8 +194,9 @@ class SensorModel:
         return np.repeat([not e.nuisance for e in self.effects], [e.size for e in self.effects])
 
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return prior values and prior standard deviations, both shape (n_params,)."""
-        return np.concatenate([e.prior_values() for e in self.effects]), np.concatenate([e.prior_sds() for e in self.effects])
+        """Return prior values and prior standard deviations, both shape (n_params,); the prior time of a step is that of its columns."""
+        values = [np.append(e.prior_values()[:-1], self.point_of(e)[-1]) if e.located else e.prior_values() for e in self.effects]
+        return np.concatenate(values), np.concatenate([e.prior_sds() for e in self.effects])
 
     def start(self) -> np.ndarray:
         """Return the values to start from: the prior's, or the point of the columns."""

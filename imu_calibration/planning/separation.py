@@ -122,6 +122,6 @@ def _places(coordinates, key):
 
 def _require_shown_by_motion(model, key):
     effect = model.catalogue.find(*key, model.joint_names)
-    if effect.role is Role.LIMIT or effect.time_constant or 'temperature' in effect.needs:
+    if effect.role is Role.LIMIT or effect.n_amplitudes < effect.size or 'temperature' in effect.needs:
         raise InputError(f"effects that motion separates must depend on it, '{key[1]}' depends on time, temperature or range; "
                          'omit it')

@@ -104,6 +104,11 @@ class Attempt:
         used = self.search.used(chosen)
         values = np.zeros(self.space.size)
         values[list(used)] = self.evidence.fit(used)[0]
+        return self.absolute(values)
+
+    def absolute(self, values: np.ndarray) -> np.ndarray:
+        """Return parameters of the whole space in full, from those that count from the linearisation, shape (q,)."""
+        values = np.array(values)
         change = counted_from_values(self.recording.model, self.baseline)
         values[:len(change)] += np.where(change, self.recording.values, 0.0)
         return values
@@ -177,7 +182,7 @@ class Attempt:
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
         for effect in model.effects:
             if effect.key not in kept:
-                start[model.slices[effect.key]] = 0.0
+                start[model.slices[effect.key]][:effect.n_amplitudes] = 0.0
         return model.at(start), start
 
     def _warm_up(self, chosen, question, values):

@@ -6,7 +6,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from imu_calibration.effects.lags import FAMILY
+from imu_calibration.effects.lags import CLOCK, FAMILY
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.errors import NotObservableError
 from imu_calibration.reference.table import Table
@@ -16,7 +16,8 @@ from imu_calibration.selection.evidence import LEAST_WINDOWS
 from imu_calibration.selection.explained_share import Explained, pruned, sensors_of
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.lag_explanations import lag_explanations
-from imu_calibration.selection.questions import Question, testable_effects, without_saturation
+from imu_calibration.selection.onset import Onset, find_onset
+from imu_calibration.selection.questions import Question, point_with, testable_effects, without_saturation
 from imu_calibration.selection.rivals import Rival, best_pairs, same_questions, settle_rivals, simpler
 from imu_calibration.selection.saturation import Saturation, windows_at, without_clipping
 from imu_calibration.selection.search import Named, Search
@@ -51,6 +52,8 @@ class Investigation(Named):
     """Questions selected by likelihood but not named: their gain is too small, or the remaining excess too large."""
     rivals: Sequence[Rival] = field(default_factory=list)
     """Alternatives to findings that fit nearly as well."""
+    onset: Onset | None = None
+    """Parameters that change at one moment: the other results are those of the longer part of the recording."""
 
     @property
     def search(self) -> Search:
@@ -62,6 +65,8 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
                 bias_processes: dict | None = None) -> Investigation:
     """
     Test every effect that a model lacks on held-out windows.
+
+    If parameters change at one moment (`find_onset`), the search is repeated: with a step of the clock, or on the longer part alone.
 
     Parameters
     ----------
@@ -92,16 +97,20 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     asked = without_saturation(effects)
     attempted = partial(Attempt, used, table, model, effects=asked, locked=locked, bias_processes=bias_processes)
     attempt = attempted(progress=lambda share: report(0.4 * share))
-    chosen = attempt.search.run()
-    chosen = [question for question in chosen if question.name not in FAMILY or attempt.windows_agree(chosen, question)]
-    report(0.5)
-    explanations = lag_explanations(attempt, [*chosen, *attempt.search.early(chosen)], attempted)
-    if explanations is not None:
-        attempted = partial(attempted, resolved=FAMILY)
-        outcome, rivals = _with_lags(explanations, attempted)
-    else:
-        settled, rivals = settle_rivals(attempt, chosen, attempted)
-        outcome = _settled(attempted, settled, chosen if settled is attempt else settled.search.run())
+    report(0.4)
+    outcome, rivals, again = _explained(attempt, attempted)
+    onset = find_onset(outcome.attempt, outcome.explained, outcome.named, windows=used, table=table) if outcome.rest else None
+    step = next((effect for effect in effects if effect.located), None)
+    if onset is not None and onset.what == CLOCK and step is not None:
+        stepped = partial(attempted, effects=[*asked, step])
+        there = stepped(point=point_with(model, [*asked, step], _as_step(step, onset)))
+        other, others, beside = _explained(there, stepped, [question for question in there.questions if question.name == step.name])
+        if other.rest < LEFT * outcome.rest:
+            outcome, rivals, again, onset = other, others, beside, None
+    if onset is not None:
+        longer = max([w for w in used if w.time[-1] < onset.time], [w for w in used if w.time[0] >= onset.time], key=len)
+        return replace(investigate(longer, table, model, progress=progress, bias_processes=bias_processes), onset=onset)
+    attempted = again
     report(0.75)
     for any_size in (False, True):
         outcome = _looked_again(outcome, partial(attempted, any_size=any_size), any_size)
@@ -110,6 +119,24 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     rivals = [rival for rival in rivals if rival.question.name in names and rival.other.name not in names]
     doubtful = [question for question in outcome.chosen if question not in (*named, *denied)]
     return Investigation(used, attempt, outcome.explained, named, limits, not_testable, denied, doubtful, rivals)
+
+
+def _as_step(step, onset):
+    """Return parameter -> value of a step of the clock at an onset."""
+    (name, before), = onset.before.items()
+    return {name: before} | dict(zip(step.param_names(), (onset.after[name] - before, onset.time)))
+
+
+def _explained(attempt, attempted, start=()):
+    """Return (the _Outcome of a search, rivals of its findings, `attempted` with the lags resolved if there are any)."""
+    chosen = attempt.search.run(start)
+    chosen = [question for question in chosen if question.name not in FAMILY or attempt.windows_agree(chosen, question)]
+    explanations = lag_explanations(attempt, [*chosen, *attempt.search.early(chosen)], attempted)
+    if explanations is not None:
+        attempted = partial(attempted, resolved=FAMILY)
+        return *_with_lags(explanations, attempted), attempted
+    settled, rivals = settle_rivals(attempt, chosen, attempted)
+    return _settled(attempted, settled, chosen if settled is attempt else settled.search.run()), rivals, attempted
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,6 +36,20 @@ def within_of_axis(space: ParameterSpace, noise: NoiseModel, sensor: str, *, axi
     return total
 
 
+def matrix_of_each(space: ParameterSpace, noise: dict[str, NoiseModel]) -> np.ndarray:
+    """Return the normal matrix of each window, shape (k, q + 1, q + 1)."""
+    moving, kind = space.recording.moving, space.recording.kind
+    total = np.zeros((len(kind), space.size + 1, space.size + 1))
+    for sensor in SENSORS:
+        variance = np.array([noise[sensor].row_variance(name) for name in kind[moving]]).reshape(-1, 3)
+        for axis, rows in enumerate(white_means(space, noise, sensor)):
+            at = space.places(sensor, axis)
+            own = rows[:, :, None] * rows[:, None, :]
+            own[moving] += space.within_each(sensor, axis, moving) / variance[:, axis, None, None]
+            total[:, at[:, None], at] += own
+    return total
+
+
 def mean_matrix(space: ParameterSpace, white: dict[str, list[np.ndarray]], select: np.ndarray | None = None) -> np.ndarray:
     """Return the part from the means of the windows, from sensor -> `white_means`."""
     total = np.zeros((space.size + 1, space.size + 1))

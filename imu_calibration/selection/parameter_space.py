@@ -1,7 +1,7 @@
 """From columns to parameters: each window's contribution to a linear problem in the parameters of all candidate effects."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -60,6 +60,18 @@ class ParameterSpace:
         found = np.zeros(self.size + 1)
         found[list(used)], found[-1] = -values, 1.0
         return found
+
+    def restricted(self, kept: np.ndarray) -> 'ParameterSpace':
+        """Return the space of some of the parameters, in this order."""
+        order = np.argsort(kept)
+        own = {sensor: [np.isin(index, kept) for index in self.index[sensor]] for sensor in SENSORS}
+
+        def cut(joins):
+            return {sensor: [join[:, np.append(mask, True)] for join, mask in zip(joins[sensor], own[sensor])] for sensor in SENSORS}
+        index = {sensor: [order[np.searchsorted(kept, index[mask], sorter=order)] for index, mask in zip(self.index[sensor], own[sensor])]
+                 for sensor in SENSORS}
+        return replace(self, names=tuple(self.names[k] for k in kept), prior_sd=self.prior_sd[kept], prior_mean=self.prior_mean[kept],
+                       index=index, join=cut(self.join), join_within=cut(self.join_within))
 
     @cached_property
     def mean(self) -> dict[str, list[np.ndarray]]:
@@ -172,10 +184,10 @@ def _join(model, sensor, axis, recording, removed, smooth):
 
 
 def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray:
-    """Return a mask of the parameters that count from the linearisation: the baseline's, and time constants."""
+    """Return a mask of the parameters that count from the linearisation: those of the baseline, time constants and times of steps."""
     masks = [np.full(e.size, e.key in baseline.slices) for e in model.effects]
     for effect, mask in zip(model.effects, masks):
-        if effect.time_constant:
+        if effect.n_amplitudes < effect.size:
             mask[-1] = True
     return np.concatenate(masks)
 

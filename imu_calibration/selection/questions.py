@@ -157,10 +157,10 @@ def point_with(model: SensorModel, effects: Sequence[Effect], values: dict[str, 
 
 
 def without_saturation(effects: Sequence[Effect]) -> list[Effect]:
-    """Return the effects that are tested by columns."""
-    return [effect for effect in effects if effect.role is not Role.LIMIT]
+    """Return the effects that are tested by columns; a step has columns only at a known time."""
+    return [effect for effect in effects if effect.role is not Role.LIMIT and not effect.located]
 
 
 def special(effect: Effect) -> bool:
-    """Return whether an effect has no columns of its own here: saturation is censoring, a warm-up has a bank of time constants."""
-    return effect.role is Role.LIMIT or effect.time_constant
+    """Return whether an effect has no columns of its own: saturation (censoring), warm-up (bank of time constants), step (its time)."""
+    return effect.role is Role.LIMIT or effect.n_amplitudes < effect.size

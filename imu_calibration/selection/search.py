@@ -126,7 +126,7 @@ class Search:
 
     def implausible(self, chosen: Sequence[Question], question: Question) -> bool:
         """Return whether the estimate of a chosen effect exceeds any known instrument; the range is a prior, not a hard limit."""
-        amplitudes = question.effect.size - question.effect.time_constant
+        amplitudes = question.effect.n_amplitudes
         value, sd = self.estimate(chosen, question)
         return question.effect.surpasses(value[:amplitudes], sd[:amplitudes])
 

@@ -179,6 +179,8 @@ BEYOND = _of(
      'test_beyond_catalogue.py::test_the_sense_of_a_rate_is_not_that_of_the_rate_of_the_earth'),
     ('a finding that a formula does without stays', '_done_without', 'sum(_1.values()) < NOT_NEEDED * sum(_2.values())', 'False',
      'test_beyond_catalogue.py'),
+    ('a gradual change is an onset', 'SUDDEN', '...', '1e9', 'test_onset.py'),
+    ('the time of a step is moved to its prior', 'SensorModel.prior', '_1.located', 'False', 'test_onset.py'),
     ('a place is known to its bins only', '_AxisRest.sharpened', '_1 is None', 'True', 'test_regimes.py'),
     ('an axis of noise carries a rest', 'ABOVE_NOISE', '...', '0.0', 'test_regimes.py'),
     ('of what scatters the whole range is told', 'NEARLY_ALL', '...', '1.0', 'test_regimes.py'),

@@ -1,0 +1,131 @@
+"""Parameters that change at one moment: exchanged axes, a displaced mount, a belt that slipped, a clock that was set."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.forward_equations import predict
+from imu_calibration.reference.table import Table
+from imu_calibration.segmentation.window import Window, all_samples
+from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.evidence import LEAST_WINDOWS
+from imu_calibration.selection.explained_share import LEAST_SHARE, SIGNIFICANT_REST, Explained
+from imu_calibration.selection.normal_matrices import matrix_of_each
+from imu_calibration.selection.questions import Question
+
+MARGIN = LEAST_WINDOWS + 1
+"""Least number of moving windows before and after an onset: the longer part, without the window of the onset, can be searched."""
+SUDDEN = 0.5
+"""Largest share of the excess of a linear change in time that an onset may have: above it the change may be gradual."""
+SIMPLER = 1.25
+"""A group of fewer parameters is preferred if its excess is at most this many times the least one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Onset:
+    """A group of parameters with one value before and another value after a moment."""
+
+    time: float
+    """Moment of the change, s since the first sample."""
+    what: str
+    """Name of the effect of the reference, or the sensors whose matrices change."""
+    before: dict[str, float]
+    """Parameter -> value before the moment."""
+    after: dict[str, float]
+    """Parameter -> value after it."""
+    sd: dict[str, float]
+    """Parameter -> standard deviation of the difference."""
+    units: dict[str, str]
+    """Parameter -> unit."""
+    share: float
+    """Share of the excess over noise that the second state removes."""
+
+    def to_mapping(self) -> dict:
+        """Return the onset as plain data."""
+        return {'time': self.time, 'what': self.what, 'share': self.share,
+                'parameters': {name: {'before': value, 'after': self.after[name], 'sd': self.sd[name], 'unit': self.units[name]}
+                               for name, value in self.before.items()}}
+
+
+def find_onset(attempt: Attempt, explained: Explained, chosen: Sequence[Question], *, windows: Sequence[Window],
+               table: Table) -> Onset | None:
+    """
+    Return the Onset that explains the residual of a choice, None without one.
+
+    For each group of parameters and each moment between two windows, the model ``columns @ values + after * columns[:, group] @ change`` is
+    fitted with the noise at rest. The onset must remove `LEAST_SHARE` of the excess, and its excess must be at most half that of a linear
+    change of the same parameters with time. The moment is then refined to the sample at which the residuals of both states are least.
+    """
+    used, space, groups = attempt.search.used(chosen), attempt.evidence.space, _groups(attempt.recording.model)
+    every = np.array(list(dict.fromkeys([*used, *(k for group in groups.values() for k in group)])))
+    small, time = space.restricted(every), space.recording.time - space.recording.time.mean()
+    each = matrix_of_each(small, explained.floor.noise)
+    total, count = each.sum(axis=0), explained.n_means + explained.n_within
+    base, noise = np.arange(len(used)), SIGNIFICANT_REST * np.sqrt(2 * count)
+    moving = np.cumsum(space.recording.moving)
+    allowed = np.flatnonzero((moving >= MARGIN) & (moving[-1] - moving >= MARGIN))
+    single = _fit(total, base, small)[0] - count
+    if single < noise or not len(allowed):
+        return None
+    after = total - np.cumsum(each, axis=0)[allowed]
+    slope, bend = (np.tensordot(time**power, each, 1) for power in (1, 2))
+    found = []
+    for name, group in groups.items():
+        at = np.flatnonzero(np.isin(every, group))
+        own = np.union1d(base, at)
+        fits = [_fit(total, own, small, (matrix, matrix, at)) for matrix in after]
+        best = int(np.argmin([loss for loss, *_ in fits]))
+        excess, gradual = fits[best][0] - count, _fit(total, own, small, (slope, bend, at))[0] - count
+        if excess < (1 - LEAST_SHARE) * single and excess < SUDDEN * gradual:
+            found.append((len(group), excess, name, allowed[best], group, every[own], fits[best][1:]))
+    if not found:
+        return None
+    most = SIMPLER * max(min(excess for _, excess, *_ in found), noise)
+    _, excess, name, last, group, own, (values, change, sd) = min(entry for entry in found if entry[1] <= most)
+    full, changed = np.zeros(attempt.space.size), np.zeros(attempt.space.size)
+    full[own], changed[group] = values, change
+    states = [attempt.absolute(full), attempt.absolute(full) + changed]
+    model, names = attempt.recording.model, [attempt.space.names[k] for k in group]
+    units = {label: effect.unit_of(k) for effect in model.effects for k, label in enumerate(effect.param_names())}
+    moment = _refined(windows, table, model, states=states, between=space.recording.time[[last, last + 1]])
+    before, after = (dict(zip(names, state[group].tolist())) for state in states)
+    return Onset(moment, name, before, after, dict(zip(names, sd.tolist())), {label: units[label] for label in names},
+                 1 - max(excess, 0.0) / single)
+
+
+def _groups(model):
+    """Return name -> parameters of each group that may change suddenly."""
+    numbers = np.arange(len(model.param_names))
+    matrices = {sensor: numbers[model.part(sensor, Role.LINEAR)] for sensor in SENSORS}
+    of_reference = {effect.name: numbers[model.slices[effect.key]] for effect in model.effects if effect.sudden}
+    return {**of_reference, **matrices, ' and '.join(SENSORS): np.concatenate(list(matrices.values()))}
+
+
+def _fit(total, own, small, changed=None):
+    """Return (loss, values, changes, sds of the changes) of the parameters `own`; `changed`: (cross products, products, places)."""
+    known = 1 / small.prior_sd[own]**2
+    normal, right = total[np.ix_(own, own)] + np.diag(known), total[own, -1] + small.prior_mean[own] * known
+    if changed is not None:
+        cross, squares, at = changed
+        normal = np.block([[normal, cross[np.ix_(own, at)]], [cross[np.ix_(at, own)], squares[np.ix_(at, at)]]])
+        right = np.append(right, cross[at, -1])
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-12, hermitian=True) / np.outer(scale, scale)
+    values, count = inverse @ right, len(own)
+    loss = total[-1, -1] + (small.prior_mean[own]**2 * known).sum() - right @ values
+    return float(loss), values[:count], values[count:], np.sqrt(np.diag(inverse)[count:])
+
+
+def _refined(windows, table, model, *, states, between):
+    """Return the moment between two times at which the sum of squares of the residuals of both states is least."""
+    near = [w for w in windows if w.time[-1] >= between[0] and w.time[0] <= between[1]]
+    motion, temperature, rows = all_samples(near)
+    outputs = (np.concatenate([w.force_s for w in near]), np.concatenate([w.rate_s for w in near]))
+    noise, squares = np.median([w.noise_sd for w in near], axis=0), []
+    for state in states:
+        made = predict(model, state[:len(model.param_names)], table, motion=motion, temperature_c=temperature)
+        squares.append(sum((((out - guess[rows]) / sd)**2).sum(axis=1) for out, guess, sd in zip(outputs, made, noise)))
+    time, cost = np.concatenate([w.time for w in near]), np.append(0.0, np.cumsum(squares[0] - squares[1]))
+    return float(time[min(int(np.argmin(cost)), len(time) - 1)])

@@ -1,0 +1,46 @@
+"""Worlds in which something changes at one moment, or the clock of the sensor runs away: each by its physics."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from worlds.physics_cause import Cause
+
+
+class Clock(Cause):
+    """Stamps by a clock of another rate, with a step after a share of the session."""
+
+    def __init__(self, rate=0.0, step=0.0, share=0.6):
+        super().__init__()
+        self.rate, self.step, self.share = rate, step, share
+
+    def stamped(self, time, rng):
+        """Return the lag of each stamp."""
+        return self.rate * time + self.step * (time > self.share * time[-1])
+
+
+class Moment(Cause):
+    """After a share of the session the axes x and y are exchanged ('axes'), the sensor is turned by `turn` ('mount', 'creep': gradually), or a joint slips ('belt')."""
+
+    def __init__(self, kind, share=0.55, turn=(0.01, -0.006, 0.008), joint=1, slip=0.03):
+        super().__init__()
+        self.kind, self.share, self.turn, self.joint, self.slip = kind, share, np.array(turn), joint, slip
+
+    def delivered(self, time, outputs, rate_s):
+        """Exchange the axes of the accelerometer."""
+        if self.kind != 'axes':
+            return outputs
+        return [np.where((time > self.share * time[-1])[:, None], outputs[0][:, [1, 0, 2]], outputs[0]), outputs[1]]
+
+    def carried(self, time, force_s, rate_s, alpha_s):
+        """Turn the sensor on its mount."""
+        if self.kind not in ('mount', 'creep'):
+            return force_s, rate_s
+        course = time > self.share * time[-1] if self.kind == 'mount' else np.clip((time / time[-1] - 0.3) / 0.4, 0.0, 1.0)
+        turned = Rotation.from_rotvec(np.outer(course, self.turn)).inv()
+        return turned.apply(force_s), turned.apply(rate_s)
+
+    def encoder_error(self, time, motion):
+        """Let the belt of a joint slip."""
+        error = np.zeros_like(motion.position)
+        error[:, self.joint] = self.slip * (time > self.share * time[-1]) * (self.kind == 'belt')
+        return error, np.zeros_like(error)
