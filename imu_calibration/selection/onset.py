@@ -70,14 +70,14 @@ def find_onset(attempt: Attempt, explained: Explained, chosen: Sequence[Question
     if single < noise or not len(allowed):
         return None
     after = total - np.cumsum(each, axis=0)[allowed]
-    slope, bend = (np.tensordot(time**power, each, 1) for power in (1, 2))
+    slope, curve = (np.tensordot(time**power, each, 1) for power in (1, 2))
     found = []
     for name, group in groups.items():
         at = np.flatnonzero(np.isin(every, group))
         own = np.union1d(base, at)
         fits = [_fit(total, own, small, (matrix, matrix, at)) for matrix in after]
         best = int(np.argmin([loss for loss, *_ in fits]))
-        excess, gradual = fits[best][0] - count, _fit(total, own, small, (slope, bend, at))[0] - count
+        excess, gradual = fits[best][0] - count, _fit(total, own, small, (slope, curve, at))[0] - count
         if excess < (1 - LEAST_SHARE) * single and excess < SUDDEN * gradual:
             found.append((len(group), excess, name, allowed[best], group, every[own], fits[best][1:]))
     if not found:
