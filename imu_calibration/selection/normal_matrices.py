@@ -45,7 +45,7 @@ def matrix_of_each(space: ParameterSpace, noise: dict[str, NoiseModel]) -> np.nd
         for axis, rows in enumerate(white_means(space, noise, sensor)):
             at = space.places(sensor, axis)
             own = rows[:, :, None] * rows[:, None, :]
-            own[moving] += space.within_each(sensor, axis, moving) / variance[:, axis, None, None]
+            own[moving] += np.concatenate(list(space.within_each(sensor, axis, moving))) / variance[:, axis, None, None]
             total[:, at[:, None], at] += own
     return total
 
