@@ -10,7 +10,7 @@ from imu_calibration.by_hand.bias_movement import bias_movements, with_movement,
 from imu_calibration.by_hand.equations import COMPONENTS, Poses, State
 from imu_calibration.by_hand.full_scale import full_scale_factor
 from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
-from imu_calibration.by_hand.model import BASE_NAMES, UPPER, HandModel, unpack
+from imu_calibration.by_hand.model import BASE_NAMES, CROSS_TERMS, UPPER, HandModel, unpack
 from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTurn
 from imu_calibration.by_hand.outliers import possible_turns, without_outliers
 from imu_calibration.by_hand.poses import average_poses, distinct_attitudes, noise_statistics
@@ -33,6 +33,8 @@ PUBLISHED = tuple(SensorModel().param_names)
 """Order of the parameters in the result; further effects follow."""
 POSES_LEAST = 4
 """With fewer attitudes even the accelerometer's biases are determined by the prior."""
+SIGNIFICANT = 1.96**2
+"""Likelihood ratio above which the data contradict a cross term of zero: 95 % of chi-square with one degree of freedom."""
 PASSES = 4
 """Largest number of solutions, when the columns of a warm-up are recomputed or poses and turns are excluded."""
 SETTLED = 0.03
@@ -248,13 +250,18 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
 
 
 def with_weak_replaced(hand: HandCalibration) -> HandCalibration:
-    """Return the calibration with weak values replaced by their prior where that lowers the expected error (`replace_weak`)."""
+    """
+    Return the calibration with weak values replaced by their prior (`replace_weak`).
+
+    Cross terms of the accelerometer are replaced if zero is not significantly worse by the likelihood ratio, because near the six faces
+    the poses determine them only through small tilts; other parameters where that lowers the expected error.
+    """
     held = np.array([status == HELD for status in hand.statuses])
     nominal = dict.fromkeys(UPPER, 0.0) | dict(zip(hand.model.param_names, hand.model.nominal))
     applied = {name for effect in hand.model.model.effects if effect.compensation == 'exact' for name in effect.param_names()}
     weak = np.flatnonzero(~held & (hand.own_sd > hand.tolerances) & np.isin(hand.param_names, list(applied)))
     values, terms, replaced = replace_weak(hand.values, hand.terms, np.array([nominal[name] for name in hand.param_names]),
-                                           weak=weak.tolist())
+                                           weak=weak.tolist(), limit=np.where(np.isin(hand.param_names, CROSS_TERMS), SIGNIFICANT, 1.0))
     known = dict(zip(hand.param_names, values))
     state = replace(hand.state, values=np.array([known[name] for name in hand.model.param_names]))
     return replace(hand, values=values, terms=terms, state=state, replaced=tuple(np.array(hand.param_names)[replaced].tolist()),

@@ -11,6 +11,7 @@ from imu_calibration.by_hand.bias_movement import notes
 from imu_calibration.by_hand.by_evidence import EvidentHand, solve_by_evidence
 from imu_calibration.by_hand.calibrate import gather_by_hand, with_weak_replaced
 from imu_calibration.by_hand.equations import TurnData
+from imu_calibration.by_hand.model import CROSS_TERMS
 from imu_calibration.by_hand.options import hand_options
 from imu_calibration.by_hand.proof import prove_by_hand, uncorrected_by_hand
 from imu_calibration.by_hand.result import HandResult
@@ -153,7 +154,7 @@ def hand_result(evident: EvidentHand, recording: HandRecording, options: Calibra
                               gathered.frame_id, dict(hand.gauge), advice, statistics,
                               conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})},
                               proof=prove_by_hand(hand, hand.used_turns if turns else (), hand_options(options).settings),
-                              covariance_terms=terms, held_reason=reasons_held(held, model.param_names, hand.replaced))
+                              covariance_terms=terms, held_reason=reasons_held(held, model.param_names, hand.replaced, tested=CROSS_TERMS))
     needed = {name: (item['needs'], float('nan')) for item in reversed(advice) for name in item['parameters']}
     return HandResult(calibration=judged(calibration, tolerances), gathered=gathered, tolerances=tolerances, needed=needed,
                       options=options, hand=hand)

@@ -50,9 +50,11 @@ def statuses(sd: Iterable[float], held: Iterable[bool], tolerances: Iterable[flo
     return tuple(HELD if h else FIXED if s == 0 else DETERMINED if s <= t else WEAK for h, s, t in zip(held, sd, tolerances, strict=True))
 
 
-def reasons_held(held: Iterable[bool], names: Iterable[str], replaced: Collection[str]) -> dict[str, str]:
-    """Return held parameter -> the reason: it is one of those `replaced` by their prior, or the data determine too little of it."""
-    return {name: REPLACEMENT if name in replaced else WEAK_DATA for name, flag in zip(names, held, strict=True) if flag}
+def reasons_held(held: Iterable[bool], names: Iterable[str], replaced: Collection[str], *,
+                 tested: Collection[str] = ()) -> dict[str, str]:
+    """Return held parameter -> the reason: `replaced` by its prior, for those `tested` by likelihood ratio, or too weak data."""
+    return {name: WEAK_DATA if name not in replaced else LIKELIHOOD_RATIO if name in tested else REPLACEMENT
+            for name, flag in zip(names, held, strict=True) if flag}
 
 
 def tolerances_of(model: SensorModel, overrides: dict | None = None) -> np.ndarray:

@@ -40,15 +40,15 @@ def of_fit(terms: Terms) -> np.ndarray:
 
 
 def replace_weak(values: np.ndarray, terms: Terms, prior: np.ndarray, *,
-                 weak: Sequence[int]) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
+                 weak: Sequence[int], limit: np.ndarray | float = 1.0) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
     """
     Return (values, terms, mask of the replaced parameters) with weak values replaced by their prior where that lowers the expected error.
 
     A value v with prior p and standard deviation s of the fit is replaced where ``(v - p)^2 < s^2``. The parameter with the smallest ratio
     is replaced first; all parameters correlated with it are updated with it fixed, ``x += C[:, k] / C[k, k] (p - v)``, C being the
     posterior covariance of the fit, before the next test. The error of the result is that of the estimate and the shift d, so that
-    its covariance is the former one plus ``d d'``: at most twice the former variance. The variance of the prior itself would ignore the
-    recording, which bounds the parameter much more closely.
+    its covariance is the former one plus ``d d'``: at most ``1 + limit`` times the former variance. The variance of the prior itself
+    would ignore the recording, which bounds the parameter much more closely.
 
     Parameters
     ----------
@@ -59,13 +59,16 @@ def replace_weak(values: np.ndarray, terms: Terms, prior: np.ndarray, *,
         Prior values; a parameter whose prior is not finite is not replaced.
     weak : sequence of int
         Parameters under test.
+    limit : array of shape (n_params,) or float
+        Largest ``(v - p)^2 / s^2`` of a replaced parameter: 1 for the smallest expected error without knowledge of the truth; the quantile
+        of chi-square for a likelihood-ratio test of the prior value.
 
     """
-    moved, posterior = values.copy(), of_fit(terms)
+    moved, posterior, limits = values.copy(), of_fit(terms), np.broadcast_to(limit, values.shape)
     replaced, smallest = np.zeros(len(values), bool), 1e-12 * np.diag(posterior)
     candidates = [k for k in weak if np.isfinite(prior[k])]
     while candidates := [k for k in candidates if posterior[k, k] > smallest[k]]:
-        ratio = [(moved[k] - prior[k])**2 / posterior[k, k] for k in candidates]
+        ratio = [(moved[k] - prior[k])**2 / posterior[k, k] / limits[k] for k in candidates]
         least = int(np.argmin(ratio))
         if ratio[least] >= 1.0:
             break

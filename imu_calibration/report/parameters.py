@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.status import COMMON_SCALE, DETERMINED, FIXED, HELD, REPLACEMENT
+from imu_calibration.calibration.status import COMMON_SCALE, DETERMINED, FIXED, HELD, LIKELIHOOD_RATIO, REPLACEMENT
 from imu_calibration.diagnosis.workflow import DiagnosisResult
 from imu_calibration.report.numbers import in_unit, pair, people, text
 
@@ -15,7 +15,9 @@ USE = {'exact': 'removed by compensation', 'flagged': 'cannot be removed, sample
 
 COMMON = 'An error of the gravity used as reference scales all readings. The sds of the other parameters are given without it.'
 UNSEEN = 'fixed at its prior: its sd would exceed half of the prior sd'
-REPLACED = 'fixed at its prior: the estimate is weak and within one sd of it, so that the prior has the smaller expected error'
+REPLACED = {
+    REPLACEMENT: 'fixed at its prior: the estimate is weak and within one sd of it, so that the prior has the smaller expected error',
+    LIKELIHOOD_RATIO: 'fixed at its prior, which is not significantly worse than the weak estimate (likelihood ratio)'}
 
 
 def parameter_groups(result: CalibrationResult | DiagnosisResult) -> list[dict[str, Any]]:
@@ -63,5 +65,5 @@ def _why(calibration, index, share):
     if status == DETERMINED:
         return ''
     if status == HELD:
-        return REPLACED if calibration.held_reason.get(name) == REPLACEMENT else UNSEEN
+        return REPLACED.get(calibration.held_reason.get(name), UNSEEN)
     return f'estimated, but its sd is {text(share, 2)} times the tolerance'

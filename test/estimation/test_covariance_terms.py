@@ -37,6 +37,8 @@ def test_a_weak_value_is_replaced_by_the_sd_of_the_fit_alone():
         np.testing.assert_allclose(total(grown), total(terms) + np.outer(shift, shift), atol=1e-12)
     _, _, replaced = replace_weak(np.array([0.5, 0.5, 0.5]), terms, np.array([0.0, 0.0, np.inf]), weak=[0, 2])
     assert replaced.tolist() == [True, False, False]   # no finite prior, no replacement
+    for limit, moves in ((1.0, False), (np.array([3.84, 1.0, 1.0]), True)):
+        assert replace_weak(np.array([1.5, 2.0, 1.0]), terms, prior, weak=[0], limit=limit)[2].tolist() == [moves, False, False]
 
 
 def test_the_sds_of_replaced_values_agree_with_their_errors():
