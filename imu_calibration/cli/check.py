@@ -27,13 +27,13 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.use_cases.check import check
     found = check(options.bag, options.calibration, stand_of(options), **choices_of(options))
     warn([finding.to_mapping() for finding in warnings(found.result.findings)])
-    out, numbers = console(), ('seconds', 'before', 'after', 'after / before', '95 %')
+    out, numbers = console(), ('seconds', 'before', 'after', 'after / before, 95 %')
     rows = []
     for sensor, entry in found.proof.items():
         for motion, part in (('all', entry), *entry['regimes'].items()):
             rows.append((sensor, motion, f'{part["seconds"]:.0f}',
                          *(error_text(part[when], part.get('unit', entry['unit'])) for when in ('before', 'after')),
-                         f'{part["after"] / max(part["before"], 1e-300):.3f}', ratio_text(part)))
+                         ratio_text(part)))
     show_table(out, ('sensor', 'motion', *numbers), rows, numbers=numbers)
     for line in str(found).splitlines():
         out.print(line, soft_wrap=True, markup=False)
