@@ -62,8 +62,9 @@ UNREACHABLE = {
                          'calibration': 'no recording is replayed'},
     'planner_node': {'anyway': 'no calibration is applied', **NAMED, 'nominal': 'no readings are compared', 'gravity': 'no calibration is estimated',
                      'calibration': 'with a plan for separation alone', 'diagnose': 'no calibration is estimated', 'inspect': 'no calibration is estimated',
-                     'temperature_topic': 'no recording is replayed'},
-    'compensator_node': {'allow_xacro': 'no robot description is read'},
+                     'temperature_topic': 'no recording is replayed', 'up': 'of transforms in a bag'},
+    'simulator_node': {'temperature_topic': 'no recording is replayed', 'up': 'of transforms in a bag'},
+    'compensator_node': {'allow_xacro': 'no robot description is read', 'up': 'of transforms in a bag'},
     'bag_player_node': {'allow_xacro': 'no robot description is read'},
 }
 """Node -> {key of errors in the modules that it imports: reason why the node needs no name for it}."""
