@@ -1,6 +1,6 @@
 """Frozen parts during motion: a gyroscope that repeats one reading, or one of several joints with a constant state."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +9,7 @@ from imu_calibration.preflight.evidence import REFUSE, CheckFinding
 from imu_calibration.preflight.frozen_parts import TURNS
 from imu_calibration.reference.kinematics import reference_motion
 from imu_calibration.reference.table import Table
+from imu_calibration.samples import smallest_step
 from imu_calibration.segmentation.window import Window
 
 LASTING = 1.0
@@ -19,6 +20,8 @@ ALONG = 0.8
 """Share of the unexplained rate that lies along the axis of a joint that is frozen, as a mean square."""
 OWN = 0.3
 """The unexplained rate along that axis is at least this share of the measured rate along it: a wrong gain causes less."""
+OFTEN = 0.25
+"""Share of repeated readings of one axis from which the steps of a gyroscope are coarser than its noise."""
 
 
 def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | None:
@@ -26,6 +29,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     Return the part that is frozen for a second or more while the remaining parts turn, or None.
 
     A joint is frozen when its state is constant while the gyroscope measures a rate about its axis that the other joints do not explain.
+    A gyroscope with steps coarser than its noise may repeat a reading while the reference rate stays within one step.
 
     Parameters
     ----------
@@ -39,13 +43,19 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
         return None
     told = [reference_motion(table, window.motion).rate_s for window in windows]
     turning = [np.linalg.norm(rate, axis=1) > TURNS for rate in told]
-    same = [np.append(np.all(np.diff(window.rate_s, axis=0) == 0, axis=1), False) for window in windows]
-    spans = _joined(span for each in zip(windows, same, turning) for span in _spans(*each))
+    repeats = [np.diff(window.rate_s, axis=0) == 0 for window in windows]
+    same = [np.append(each.all(axis=1), False) for each in repeats]
+    bias = np.median(np.concatenate([window.rate_s - rate for window, rate in zip(windows, told)]), axis=0)
+    coarse = np.concatenate(repeats).mean() > OFTEN
+    step = np.min([smallest_step(window.rate_s) for window in windows], axis=0) if coarse else np.zeros(3)
+    spans = _joined((float(window.time[start]), float(window.time[stop - 1]))
+                    for window, flags, turns, rate in zip(windows, same, turning, told) for start, stop in _runs(flags)
+                    if window.time[stop - 1] - window.time[start] >= LASTING and turns[start:stop].mean() > 0.5
+                    and not _rounded(window.rate_s[start], rate[start:stop], bias, step))
     if spans:
         return CheckFinding('frozen', REFUSE, 'the gyroscope must measure all the time, '
                             f'it repeats one reading {_words(spans)} while the joints turn; '
                             'check the sensor and its driver, and exclude that time')
-    bias = np.median(np.concatenate([window.rate_s - rate for window, rate in zip(windows, told)]), axis=0)
     for k, name in enumerate(table.joint_names):
         spans = _joined(span for window, rate in zip(windows, told) for span in _frozen(window, table, rate + bias, joint=k))
         if spans:
@@ -70,11 +80,10 @@ def _frozen(window, table, told, *, joint):
             yield float(window.time[start]), float(window.time[stop - 1])
 
 
-def _spans(window, same, turning) -> Iterator[tuple[float, float]]:
-    """Yield (start, stop) of lasting runs of `same`, during most of which the joints turn."""
-    for start, stop in _runs(same):
-        if window.time[stop - 1] - window.time[start] >= LASTING and turning[start:stop].mean() > 0.5:
-            yield float(window.time[start]), float(window.time[stop - 1])
+def _rounded(reading, told, bias, step):
+    """Return whether one reading represents the reference rates, shape (n, 3), up to one step and a wrong gain."""
+    error = np.abs(reading - told - bias)
+    return bool((np.ptp(told, axis=0) <= step).all() and (error <= step + OWN * np.abs(told)).all())
 
 
 def _runs(flags):

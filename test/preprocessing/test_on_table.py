@@ -238,3 +238,21 @@ def test_a_live_session_tells_the_same_causes(gimbals):
     session.push(joints(block, ('middle', 'outer', 'inner')))
     with refused(InputError, 'on_table', 'outer', 'middle'):
         session.solve(pending=True)
+
+
+def test_a_coarse_gyroscope_may_repeat_the_reading_of_a_constant_rate_and_no_other(gimbals):
+    """With steps of 0.02 rad/s a constant rate is one reading; the same reading while the rate changes, or at another rate, is a standstill."""
+    table, time = gimbals[1], np.arange(4000) * 0.01
+    rate = np.zeros((4000, 3))
+    rate[:, 0] = np.where(time < 20, 1.0, np.sin(time))
+    motion = JointMotion(time, np.cumsum(rate, axis=0) * 0.01, rate, np.zeros((4000, 3)), np.zeros((4000, 3)))
+    reference = reference_motion(table, motion)
+
+    def checked(changed):
+        readings = 0.02 * np.round(changed / 0.02)
+        return standing_still([Window(WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, reference.force_s, readings, motion)], table)
+    assert checked(1.02 * reference.rate_s) is None
+    moving, constant = reference.rate_s.copy(), reference.rate_s.copy()
+    moving[2000:2110] = moving[2000]
+    constant[500:1500] = 0.0
+    assert checked(moving).check == checked(constant).check == 'frozen'
