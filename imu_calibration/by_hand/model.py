@@ -18,7 +18,7 @@ UPPER = tuple(linear_names('accelerometer')[np.triu_indices(3, 1)].tolist())
 """Zero by the choice of axes."""
 BASE_NAMES = tuple(name for name in SensorModel().param_names if name not in UPPER)
 """Parameters of every calibration by hand, in their order."""
-CROSS_TERMS = tuple(name for name in BASE_NAMES if name.startswith('accelerometer.matrix') and name[-1] != name[-2])
+CROSS_TERMS = tuple(linear_names('accelerometer')[np.tril_indices(3, -1)].tolist())
 """Estimated off-diagonal entries of the accelerometer matrix."""
 N_BASE = len(BASE_NAMES)
 ACCELEROMETER, GYRO_BIAS, GYRO_MATRIX = slice(0, 9), slice(9, 12), slice(12, 21)
