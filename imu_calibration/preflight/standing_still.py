@@ -47,7 +47,9 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     same = [np.append(each.all(axis=1), False) for each in repeats]
     bias = np.median(np.concatenate([window.rate_s - rate for window, rate in zip(windows, told)]), axis=0)
     coarse = np.concatenate(repeats).mean() > OFTEN
-    step = np.min([smallest_step(window.rate_s) for window in windows], axis=0) if coarse else np.zeros(3)
+    step = np.min([smallest_step(window.rate_s) for window in windows], axis=0)
+    known = np.isfinite(step)   # an axis without motion has the steps of the other axes
+    step = np.where(known, step, step[known].max(initial=0.0)) if coarse else np.zeros(3)
     spans = _joined((float(window.time[start]), float(window.time[stop - 1]))
                     for window, flags, turns, rate in zip(windows, same, turning, told) for start, stop in _runs(flags)
                     if window.time[stop - 1] - window.time[start] >= LASTING and turns[start:stop].mean() > 0.5
@@ -81,9 +83,9 @@ def _frozen(window, table, told, *, joint):
 
 
 def _rounded(reading, told, bias, step):
-    """Return whether one reading represents the reference rates, shape (n, 3), up to one step and a wrong gain."""
-    error = np.abs(reading - told - bias)
-    return bool((np.ptp(told, axis=0) <= step).all() and (error <= step + OWN * np.abs(told)).all())
+    """Return whether one reading represents the reference rates, shape (n, 3), up to one step per axis and wrong gains and axes."""
+    error = np.linalg.norm(reading - told - bias, axis=1)
+    return bool((np.ptp(told, axis=0) <= step).all() and (error <= np.linalg.norm(step) + OWN * np.linalg.norm(told, axis=1)).all())
 
 
 def _runs(flags):
