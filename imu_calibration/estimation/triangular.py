@@ -14,7 +14,7 @@ PANEL = 4
 
 
 def triangular(rows: np.ndarray) -> np.ndarray:
-    """Return the triangular factor of `rows` by Householder reflections, block after block, with as many rows as it has rank bound."""
+    """Return the triangular factor of `rows`, shape (min(m, n), n), by Householder reflections of one block after the other."""
     count, width = rows.shape
     if count < 2 * width:
         return _r_factor(np.array(rows, order='F'))
@@ -63,7 +63,7 @@ def _size(rows, width):
 
 @lru_cache(maxsize=8)
 def _places(width):
-    """Return the positions of the upper triangle in a flat square matrix; those of its first rows come first."""
+    """Return the positions of the upper triangle in a flat square matrix, row by row."""
     return np.flatnonzero(np.triu(np.ones((width, width), bool)))
 
 

@@ -41,17 +41,17 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     windows = [window for window in windows if len(window) > 2 and len(window.motion) == len(window)]
     if not windows:
         return None
-    told = [reference_motion(table, window.motion).rate_s for window in windows]
-    turning = [np.linalg.norm(rate, axis=1) > TURNS for rate in told]
+    expected = [reference_motion(table, window.motion).rate_s for window in windows]
+    turning = [np.linalg.norm(rate, axis=1) > TURNS for rate in expected]
     repeats = [np.diff(window.rate_s, axis=0) == 0 for window in windows]
     same = [np.append(each.all(axis=1), False) for each in repeats]
-    bias = np.median(np.concatenate([window.rate_s - rate for window, rate in zip(windows, told)]), axis=0)
+    bias = np.median(np.concatenate([window.rate_s - rate for window, rate in zip(windows, expected)]), axis=0)
     coarse = np.concatenate(repeats).mean() > OFTEN
     step = np.min([smallest_step(window.rate_s) for window in windows], axis=0)
     known = np.isfinite(step)   # an axis without motion has the steps of the other axes
     step = np.where(known, step, step[known].max(initial=0.0)) if coarse else np.zeros(3)
     spans = _joined((float(window.time[start]), float(window.time[stop - 1]))
-                    for window, flags, turns, rate in zip(windows, same, turning, told) for start, stop in _runs(flags)
+                    for window, flags, turns, rate in zip(windows, same, turning, expected) for start, stop in _runs(flags)
                     if window.time[stop - 1] - window.time[start] >= LASTING and turns[start:stop].mean() > 0.5
                     and not _rounded(window.rate_s[start], rate[start:stop], bias, step))
     if spans:
@@ -59,7 +59,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
                             f'it repeats one reading {_words(spans)} while the joints turn; '
                             'check the sensor and its driver, and exclude that time')
     for k, name in enumerate(table.joint_names):
-        spans = _joined(span for window, rate in zip(windows, told) for span in _frozen(window, table, rate + bias, joint=k))
+        spans = _joined(span for window, rate in zip(windows, expected) for span in _frozen(window, table, rate + bias, joint=k))
         if spans:
             return CheckFinding('frozen', REFUSE, 'joint states must follow the table, '
                                 f'{name} is constant {_words(spans)} while the IMU turns about its '
@@ -67,12 +67,12 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     return None
 
 
-def _frozen(window, table, told, *, joint):
+def _frozen(window, table, expected, *, joint):
     """Yield (start, stop) in which a joint's state is constant while the residual rate is along its axis."""
     for start, stop in _runs(np.abs(window.motion.rate[:, joint]) < STILL):
         if window.time[stop - 1] - window.time[start] < LASTING:
             continue
-        motion, rest = window.motion.select(slice(start, stop)), (window.rate_s - told)[start:stop]
+        motion, rest = window.motion.select(slice(start, stop)), (window.rate_s - expected)[start:stop]
         faster = motion.rate.copy()
         faster[:, joint] += 1.0
         axis = reference_motion(table, replace(motion, rate=faster)).rate_s - reference_motion(table, motion).rate_s
@@ -82,10 +82,10 @@ def _frozen(window, table, told, *, joint):
             yield float(window.time[start]), float(window.time[stop - 1])
 
 
-def _rounded(reading, told, bias, step):
+def _rounded(reading, expected, bias, step):
     """Return whether one reading represents the reference rates, shape (n, 3), up to one step per axis and wrong gains and axes."""
-    error = np.linalg.norm(reading - told - bias, axis=1)
-    return bool((np.ptp(told, axis=0) <= step).all() and (error <= np.linalg.norm(step) + OWN * np.linalg.norm(told, axis=1)).all())
+    error = np.linalg.norm(reading - expected - bias, axis=1)
+    return bool((np.ptp(expected, axis=0) <= step).all() and (error <= np.linalg.norm(step) + OWN * np.linalg.norm(expected, axis=1)).all())
 
 
 def _runs(flags):
