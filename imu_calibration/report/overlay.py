@@ -78,11 +78,16 @@ def _sensor(traces, sensor, against, first):
     return {'sensor': sensor, 'unit': unit, 'bands': bands, 'rows': rows}
 
 
-def _histogram(title, unit, residuals):
+def histogram(residuals: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return (middles of the bins, name -> counts) of residuals, shape (n,) each; the bins contain 99.9 % of each."""
     limit = max(float(np.quantile(np.abs(own), 0.999)) for own in residuals.values()) or 1.0
     edges = np.linspace(-limit, limit, HISTOGRAM_BINS + 1)
-    return _chart(title, f'residual, {unit}', edges[:-1] + edges[1] / 2 - edges[0] / 2,
-                  {when: np.histogram(own, edges)[0] for when, own in residuals.items()}, kind='steps')
+    return edges[:-1] + edges[1] / 2 - edges[0] / 2, {name: np.histogram(own, edges)[0] for name, own in residuals.items()}
+
+
+def _histogram(title, unit, residuals):
+    middles, counts = histogram(residuals)
+    return _chart(title, f'residual, {unit}', middles, counts, kind='steps')
 
 
 def _chart(title, x, values, series, kind='line'):

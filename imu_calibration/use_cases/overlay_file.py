@@ -8,11 +8,10 @@ import numpy as np
 
 from imu_calibration.diagnosis.traces import Traces
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.report.overlay import HISTOGRAM_BINS
+from imu_calibration.report.overlay import WHEN, histogram
 from imu_calibration.use_cases.foxglove_file import foxglove
 
 OVERLAY, RESIDUAL, SPECTRUM, HISTOGRAM = '/overlay', '/residual', '/residual_spectrum', '/residual_histogram'
-WHEN = ('before', 'after')
 
 
 def overlay_bytes(traces: Traces, joint_names: Sequence[str]) -> bytes:
@@ -21,7 +20,7 @@ def overlay_bytes(traces: Traces, joint_names: Sequence[str]) -> bytes:
 
     ``/overlay/SENSOR/AXIS`` has measured, simulated_before and simulated_after on the segment with the largest difference;
     ``/residual/SENSOR`` the residual before and after with time, force, rate, angles and temperature; ``/residual_spectrum/SENSOR`` and
-    ``/residual_histogram/SENSOR`` arrays of the same length, by axis.
+    ``/residual_histogram/SENSOR/AXIS`` arrays of the same length.
 
     Raises
     ------
@@ -53,12 +52,10 @@ def _topics(traces, joint_names):
             frequency, density, noise = traces.distances[sensor].density()
             yield f'{SPECTRUM}/{sensor}', [(time, {'frequency': frequency.tolist(), 'noise': _by_axis(noise),
                                                    **{when: _by_axis(own) for when, own in zip(WHEN, density)}}) for time in (0.0, end)]
-        residuals = [getattr(traces, when)[sensor] for when in WHEN]
-        limit = float(np.quantile(np.abs(residuals[0]), 0.999)) or 1.0
-        edges = np.linspace(-limit, limit, HISTOGRAM_BINS + 1)
-        counts = [np.column_stack([np.histogram(own[:, k], edges)[0] for k in range(3)]) for own in residuals]
-        yield f'{HISTOGRAM}/{sensor}', [(time, {'residual': ((edges[:-1] + edges[1:]) / 2).tolist(),
-                                                **{when: _by_axis(own) for when, own in zip(WHEN, counts)}}) for time in (0.0, end)]
+        for k, axis in enumerate(AXES):
+            middles, counts = histogram({when: getattr(traces, when)[sensor][:, k] for when in WHEN})
+            content = {'residual': middles.tolist(), **{when: own.tolist() for when, own in counts.items()}}
+            yield f'{HISTOGRAM}/{sensor}/{axis}', [(time, content) for time in (0.0, end)]
 
 
 def _residual(traces, sensor, joint_names, k):

@@ -178,5 +178,5 @@ def test_the_overlay_of_a_diagnosis_contains_its_segments_residuals_spectra_and_
     assert set(residual[0][1]['angle']) == {'outer', 'middle', 'inner'}
     [(start, spectrum), (end, _)] = written['/residual_spectrum/accelerometer'][2]
     assert (start, end) == pytest.approx((0.0, traces.time[-1])) and len(spectrum['frequency']) == len(spectrum['after']['x']) > 5
-    histogram = written['/residual_histogram/gyroscope'][2][0][1]
-    assert 0.9 * len(traces.time) < sum(histogram['before']['x']) <= len(traces.time) and len(histogram['residual']) == 40
+    histogram = written['/residual_histogram/gyroscope/x'][2][0][1]
+    assert 0.9 * len(traces.time) < sum(histogram['before']) <= len(traces.time) and len(histogram['residual']) == 40
