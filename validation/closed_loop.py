@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from imu_calibration.effects.base import AXES
 from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.use_cases.choices import catalogue_of
 from imu_calibration.use_cases.diagnose import diagnose
@@ -54,37 +55,27 @@ def measured_sessions(names):
 
 
 def sizes_of(found):
-    """Return {name: (values, sds)} of the findings and formulas, implausible findings excepted."""
-    sizes = {finding.effect: tuple(np.array([[value, sd] for value, sd, _ in finding.parameters.values()]).T)
+    """Return {name: {parameter: (value, sd)}} of the findings and formulas, implausible findings excepted."""
+    sizes = {finding.effect: {name: (value, sd) for name, (value, sd, _) in finding.parameters.items()}
              for finding in found.findings if not finding.implausible}
     for rest in found.result.diagnosis.unexplained.values():
         if rest.proposal:
-            sizes |= {column: pair for column, *pair in zip(rest.proposal.columns, rest.proposal.values, rest.proposal.sds)}
+            sizes |= {column: dict(zip(AXES, zip(values, sds)))
+                      for column, values, sds in zip(rest.proposal.columns, rest.proposal.values, rest.proposal.sds)}
     return sizes
 
 
-def loop(measured, simulated, seed):
-    """Return (row, first diagnosis): the second diagnosis is of a simulation of the first result, `simulated`, on the same motion."""
-    first = diagnose(measured.samples, measured.table)
-    return compared(first, simulated(first), measured, seed), first
-
-
-def compared(first, calibration, measured, seed):
-    """Simulate a calibration on the motion of a session, diagnose the simulation and compare names and sizes."""
+def compared(expected, calibration, measured, seed):
+    """Simulate a calibration on the motion of a session, diagnose the simulation and compare with {name: {parameter: value}}."""
     second = diagnose(replay(measured.samples, calibration, measured.table, seed=seed).samples, measured.table)
-    one, other = sizes_of(first), sizes_of(second)
+    found = sizes_of(second)
     classes = {finding.effect: {finding.effect, *finding.indistinguishable_from} for finding in second.findings}
     classes |= {column: {column, *rest.proposal.alike} for rest in second.result.diagnosis.unexplained.values() if rest.proposal
                 for column in rest.proposal.columns}
-    again = {name for name in one if any(name in members for members in classes.values())}
-    z = [value for name in one.keys() & other.keys() if one[name][0].shape == other[name][0].shape
-         for value in (other[name][0] - one[name][0]) / other[name][1]]
-    return {'found': sorted(one), 'again': sorted(again), 'new': sorted(name for name in other if not classes[name] & one.keys()), 'z': z}
-
-
-def extended(found):
-    """Return the calibration with the findings and formulas."""
-    return found.proposed or found.calibration
+    again = [name for name in expected if any(name in members for members in classes.values())]
+    z = [(value - expected[name][part]) / sd for name in expected.keys() & found.keys() for part, (value, sd) in found[name].items()
+         if part in expected[name]]
+    return {'found': sorted(expected), 'again': sorted(again), 'new': sorted(name for name in found if not classes[name] & expected.keys()), 'z': z}
 
 
 def exchanged(calibration, finding, mate):
@@ -109,38 +100,29 @@ def run(names, seed):
     """Print a line for each loop and return the rows."""
     rows = []
     for seed, (name, make) in enumerate(measured_sessions(names), seed):
-        start = time.process_time()
+        start, found = time.process_time(), []
         try:
             measured = make(seed)
-            row, first = loop(measured, extended, seed + 1000)
-            rows.append({'cause': name, 'kind': 'formula' if name in TEMPLATES else 'effect'} | row)
+            first = diagnose(measured.samples, measured.table)
+            sizes = {effect: {part: value for part, (value, _) in own.items()} for effect, own in sizes_of(first).items()}
+            found.append({'cause': name, 'kind': 'formula' if name in TEMPLATES else 'effect'}
+                         | compared(sizes, first.proposed or first.calibration, measured, seed + 1000))
             for finding in first.findings:
                 for mate in finding.indistinguishable_from:
                     other = exchanged(first.calibration, finding, mate)
                     if other is not None:
-                        rows.append({'cause': f'{mate} for {finding.effect}', 'kind': 'pair'} | compared_mate(first, finding, mate, other, measured, seed + 2000))
+                        others = {effect: own for effect, own in sizes.items() if effect != finding.effect}
+                        mates = {part: value for part, (value, _) in finding.sizes_of_mates[mate].items()}
+                        found.append({'cause': f'{mate} for {finding.effect}', 'kind': 'pair'}
+                                     | compared(others | {mate: mates}, other, measured, seed + 2000))
         except ImuCalibrationError as error:
-            rows.append({'cause': name, 'kind': 'refused', 'found': [], 'again': [], 'new': [], 'z': [], 'why': str(error)})
-        for row in rows:
-            if not row.get('printed'):
-                row['printed'] = True
-                print(f"{row['cause']}: found {', '.join(row['found']) or 'nothing'}; again {', '.join(row['again']) or 'nothing'}; new "
-                      f"{', '.join(row['new']) or 'nothing'}; z {' '.join(f'{z:.1f}' for z in row['z'])} {row.get('why', '')} "
-                      f'({time.process_time() - start:.0f} s)', flush=True)
+            found.append({'cause': name, 'kind': 'refused', 'found': [], 'again': [], 'new': [], 'z': [], 'why': str(error)})
+        for row in found:
+            print(f"{row['cause']}: found {', '.join(row['found']) or '-'}; again {', '.join(row['again']) or '-'}; new "
+                  f"{', '.join(row['new']) or '-'}; z {' '.join(f'{z:.1f}' for z in row['z'])} {row.get('why', '')} "
+                  f'({time.process_time() - start:.0f} s)', flush=True)
+        rows += found
     return rows
-
-
-def compared_mate(first, finding, mate, calibration, measured, seed):
-    """Return the row of a simulation with `mate` in the place of a finding: its class must be found again."""
-    second = diagnose(replay(measured.samples, calibration, measured.table, seed=seed).samples, measured.table)
-    expected = [mate if each.effect == finding.effect else each.effect for each in first.findings if not each.implausible]
-    classes = {each.effect: {each.effect, *each.indistinguishable_from} for each in second.findings}
-    other, z = sizes_of(second), []
-    if mate in other:
-        estimated = next(each for each in second.findings if each.effect == mate).parameters
-        z = [(estimated[name][0] - value) / estimated[name][1] for name, (value, _) in finding.sizes_of_mates[mate].items() if name in estimated]
-    again = [name for name in expected if any(name in members for members in classes.values())]
-    return {'found': sorted(expected), 'again': sorted(again), 'new': sorted(name for name in classes if not classes[name] & {*expected, finding.effect}), 'z': z}
 
 
 def table_of_rows(rows):
@@ -148,9 +130,9 @@ def table_of_rows(rows):
     lines = []
     for kind in ('effect', 'formula', 'pair'):
         own = [row for row in rows if row['kind'] == kind]
-        told = [row for row in own if row['found']]
+        named = [row for row in own if row['found']]
         z = np.array([value for row in own for value in row['z']])
-        lines.append((kind, str(len(own)), str(len(told)), str(sum(row['again'] == row['found'] for row in told)),
+        lines.append((kind, str(len(own)), str(len(named)), str(sum(row['again'] == row['found'] for row in named)),
                       str(sum(bool(row['new']) for row in own)), '–' if not z.size else f'{np.sqrt(np.mean(z ** 2)):.2f}',
                       '–' if not z.size else f'{np.mean(np.abs(z) < 2):.2f} of {z.size}'))
     return markdown_table(('cause', 'sessions', 'with a finding', 'same finding', 'other names', 'rms z', 'share with |z| < 2'), lines)
