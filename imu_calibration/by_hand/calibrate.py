@@ -21,7 +21,7 @@ from imu_calibration.calibration.status import FIXED, HELD, statuses
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
 from imu_calibration.errors import InputError, NotObservableError
-from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, Terms, replace_weak, total, with_term
+from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, Terms, replace_weak, sd_without, total, with_term
 from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.progress import report
 from imu_calibration.samples import ImuSamples
@@ -95,7 +95,7 @@ class HandCalibration:
     @property
     def own_sd(self) -> np.ndarray:
         """Standard deviation of each parameter relative to gravity as used, without its uncertainty (`common_scale`), shape (n,)."""
-        return np.sqrt(np.diag(self.covariance - self.terms[GRAVITY]))
+        return sd_without(self.terms, GRAVITY)
 
     def value(self, name: str) -> float:
         """Return the parameter called `name`."""
@@ -233,7 +233,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
     used, poses = poses, data.poses   # the result has all poses unchanged, also excluded and drifting ones
     goals = model.tolerances(options.tolerances)
-    status = statuses(np.sqrt(np.diag(total(terms) - terms[GRAVITY])), found.held, goals)
+    status = statuses(sd_without(terms, GRAVITY), found.held, goals)
     statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
                   'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()},
                   **_statistics(model, found, poses, turns)}
@@ -265,7 +265,7 @@ def with_weak_replaced(hand: HandCalibration) -> HandCalibration:
     known = dict(zip(hand.param_names, values))
     state = replace(hand.state, values=np.array([known[name] for name in hand.model.param_names]))
     return replace(hand, values=values, terms=terms, state=state, replaced=tuple(np.array(hand.param_names)[replaced].tolist()),
-                   statuses=statuses(np.sqrt(np.diag(total(terms) - terms[GRAVITY])), held | replaced, hand.tolerances))
+                   statuses=statuses(sd_without(terms, GRAVITY), held | replaced, hand.tolerances))
 
 
 def _settled(model, found):
