@@ -68,8 +68,8 @@ setup(
             f'{NAME} = {NAME}.cli.main:main',
             *(f'{node} = {NAME}.nodes.{node}:main' for node in NODES),
         ],
-        'ros2cli.command': [f'imu = {NAME}.ros2.command:ImuCommand'],
-        'ros2doctor.checks': [f'ImuCheck = {NAME}.ros2.doctor:ImuCheck'],
-        'ros2doctor.report': [f'ImuReport = {NAME}.ros2.doctor:ImuReport'],
+        'ros2cli.command': [f'imu = {NAME}.cli.ros2:ImuCommand'],
+        'ros2doctor.checks': [f'ImuCheck = {NAME}.nodes.doctor:ImuCheck'],
+        'ros2doctor.report': [f'ImuReport = {NAME}.nodes.doctor:ImuReport'],
     },
 )

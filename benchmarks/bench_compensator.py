@@ -22,7 +22,7 @@ if __name__ == '__main__':
 
 import numpy as np  # noqa: E402
 
-from imu_calibration.calibration.document_text import (
+from imu_calibration.document.calibration_text import (
     Calibration,  # noqa: E402
     calibration_to_text,  # noqa: E402
 )

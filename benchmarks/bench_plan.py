@@ -21,13 +21,14 @@ import numpy as np  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))
 
-from imu_calibration.calibration.options import CalibrationOptions, choose_model  # noqa: E402
-from imu_calibration.calibration.status import tolerances_of  # noqa: E402
+from imu_calibration.core.samples import SampleBlock  # noqa: E402
 from imu_calibration.effects.base import SENSORS  # noqa: E402
 from imu_calibration.effects.sensor_model import (
     NAMED_MODELS,  # noqa: E402
     SensorModel,  # noqa: E402
 )
+from imu_calibration.estimation.status import tolerances_of  # noqa: E402
+from imu_calibration.kinematics.motion_limits import limits_of  # noqa: E402
 from imu_calibration.planning.belief import exact_information  # noqa: E402
 from imu_calibration.planning.coordinates import Coordinates  # noqa: E402
 from imu_calibration.planning.planner import Planner, make_planner  # noqa: E402
@@ -36,8 +37,7 @@ from imu_calibration.planning.situation import (
     Situation,  # noqa: E402
     noise_of_grade,  # noqa: E402
 )
-from imu_calibration.reference.motion_limits import limits_of  # noqa: E402
-from imu_calibration.samples import SampleBlock  # noqa: E402
+from imu_calibration.references.options import CalibrationOptions, choose_model  # noqa: E402
 from imu_calibration.simulation.motion_builder import Profile  # noqa: E402
 from imu_calibration.simulation.profiles import make_profile  # noqa: E402
 from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402

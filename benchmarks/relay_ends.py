@@ -14,9 +14,9 @@ import numpy as np  # noqa: E402
 import rclpy  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 
+from imu_calibration.core.samples import ImuSamples  # noqa: E402
 from imu_calibration.nodes import relay_loop  # noqa: E402
 from imu_calibration.nodes.inputs import input_qos, output_qos  # noqa: E402
-from imu_calibration.samples import ImuSamples  # noqa: E402
 from msg_adapters.encode import encode_imu  # noqa: E402
 from msg_adapters.imu import find_imu_layout  # noqa: E402
 

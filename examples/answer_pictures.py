@@ -6,10 +6,10 @@ import numpy as np
 import yaml
 from matplotlib.figure import Figure
 
-from imu_calibration import files
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.document import files
+from imu_calibration.document.exports.export import all_targets
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.exports.export import all_targets
-from imu_calibration.samples import ImuSamples
 from imu_calibration.use_cases.compensate import compensate
 from imu_calibration.use_cases.exporting import export_calibration
 from imu_calibration.use_cases.noise import noise

@@ -8,13 +8,13 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from visualization_msgs.msg import Marker
 
-from imu_calibration.by_hand.advice import foretold
-from imu_calibration.by_hand.hand_step import HandStep
-from imu_calibration.by_hand.next_pose import knowledge_of
-from imu_calibration.by_hand.options import HandOptions
-from imu_calibration.by_hand.status import NOTHING
+from imu_calibration.calibration.advice import foretold
 from imu_calibration.calibration.coverage import DIRECTIONS, Bar, Coverage, Step
+from imu_calibration.calibration.hand_step import HandStep
+from imu_calibration.calibration.next_pose import knowledge_of
+from imu_calibration.calibration.pose_scan import NOTHING
 from imu_calibration.nodes.coverage_markers import markers_of
+from imu_calibration.references.gravity.hand_options import HandOptions
 
 PICTURE = Path(__file__).resolve().parents[1] / 'docs' / 'coverage.png'
 MINIMUM = 8.0

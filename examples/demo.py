@@ -8,12 +8,12 @@ import argparse
 import shutil
 from pathlib import Path
 
-from imu_calibration import files
-from imu_calibration.calibration.status import LACKING
 from imu_calibration.cli.main import main
 from imu_calibration.cli.show import console
 from imu_calibration.compensation import evaluation
-from imu_calibration.units import error_text, significant
+from imu_calibration.core.units import error_text, significant
+from imu_calibration.document import files
+from imu_calibration.estimation.status import LACKING
 from imu_calibration.use_cases.recordings import source_of
 
 

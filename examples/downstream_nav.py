@@ -20,15 +20,15 @@ from scipy.spatial.transform import Rotation
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from imu_calibration import files  # noqa: E402
 from imu_calibration.compensation.stops import StopDetector  # noqa: E402
+from imu_calibration.core.samples import ImuSamples  # noqa: E402
+from imu_calibration.document import files  # noqa: E402
 from imu_calibration.effects.forward_equations import sensor_output  # noqa: E402
-from imu_calibration.nodes.processes import NodeProcesses  # noqa: E402
-from imu_calibration.reference.reference_motion import (
+from imu_calibration.kinematics.reference_motion import (
     Reference,  # noqa: E402
     align,  # noqa: E402
 )
-from imu_calibration.samples import ImuSamples  # noqa: E402
+from imu_calibration.nodes.processes import NodeProcesses  # noqa: E402
 from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
 from msg_adapters.imu_stream import ImuStream  # noqa: E402
 from msg_adapters.write import write_session  # noqa: E402

@@ -19,7 +19,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from imu_calibration import files  # noqa: E402
+from imu_calibration.document import files  # noqa: E402
 from imu_calibration.nodes.processes import NodeProcesses  # noqa: E402
 
 G, DEG = 9.80665, np.pi / 180
@@ -202,8 +202,8 @@ def picture(path, watcher, calibration, errors):
     matplotlib.use('Agg')
     import matplotlib.pyplot as plt
 
-    from imu_calibration.calibration.document_text import calibration_from_text
-    from imu_calibration.calibration.status import tolerances_of
+    from imu_calibration.document.calibration_text import calibration_from_text
+    from imu_calibration.estimation.status import tolerances_of
     start = next(at for at, text, _ in watcher.drive if not text.startswith('idle'))
     figure, (known, left) = plt.subplots(2, 1, figsize=(9, 7), constrained_layout=True)
     usual, lines = files.read_tolerances(ROOT / 'config' / 'tolerances.yaml'), {}

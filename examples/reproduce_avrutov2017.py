@@ -5,7 +5,7 @@ import itertools
 
 import numpy as np
 
-from imu_calibration.errors import NotObservableError
+from imu_calibration.core.errors import NotObservableError
 from imu_calibration.papers import avrutov2017 as avrutov
 from imu_calibration.papers import avrutov2017 as avrutov_budget
 from imu_calibration.papers.linear_least_squares import condition_numbers, null_directions, numerical_rank

@@ -3,9 +3,9 @@
 
 import numpy as np
 
-from imu_calibration import navigation
-from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.errors import NotObservableError
+from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.core.errors import NotObservableError
+from imu_calibration.kinematics import strapdown
 from imu_calibration.papers import zhang2017 as zhang
 from imu_calibration.papers import zhang2017_navigation as zhang_claims
 from imu_calibration.papers.zhang2017_joint_fit import (
@@ -153,7 +153,7 @@ def print_spins():
     heading('Constant spins at 100 deg/s with Table 3 uncompensated: summed in the body frame | navigated in the level frame')
     for axis, seconds in (((1, 0, 0), 100), ((0, 1, 0), 100), ((0, 0, 1), 100), ((1, 1, 1), 60), ((1, 1, 0), 60), ((1, -1, 1), 60)):
         growth = zhang_claims.spin_growth(SENSOR.cosines, ARMS, axis, seconds=seconds)
-        (body_v, body_p), (level_v, level_p) = ([navigation.largest(part) for part in growth[key]] for key in ('body', 'level'))
+        (body_v, body_p), (level_v, level_p) = ([strapdown.largest(part) for part in growth[key]] for key in ('body', 'level'))
         print(f'axis {axis!s:11s} {seconds:3d} s: {body_v:5.2f} m/s {body_p:6.1f} m | {level_v:6.3f} m/s {level_p:6.2f} m, '
               f'steady along the axis {growth["axial_mg"]:+.3f} mg')
 
@@ -216,8 +216,8 @@ def findings():
     acceleration = np.deg2rad(100) ** 2 * 0.01
     growth = zhang_claims.spin_growth(SENSOR.cosines, ARMS, (1, 0, 0))
     yield (f'"3 m/s and 150 m in 100 s" is {100 * acceleration:.2f} m/s and {5000 * acceleration:.0f} m by arithmetic, but the error turns '
-           f'with the body: with Table 3 it stays below {navigation.largest(growth["level"][0]):.3f} m/s and '
-           f'{navigation.largest(growth["level"][1]):.1f} m.')
+           f'with the body: with Table 3 it stays below {strapdown.largest(growth["level"][0]):.3f} m/s and '
+           f'{strapdown.largest(growth["level"][1]):.1f} m.')
     constant = 4.0**2 / (2 * 100.0)
     yield (f'4 m/s and 100 m belong to a constant {1e3 * constant / G:.2f} mg over {4.0 / constant:.0f} s; 0.02 m/s and 0.3 m to another '
            f'length, {2 * 0.3 / 0.02:.0f} s. z of Table 2 gives {zhang.TABLE_2_G[2, 0] * -G * 47.4:.2f} m/s and '

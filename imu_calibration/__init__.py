@@ -43,30 +43,24 @@ Contents
 From the lowest layer; each package imports only packages above it in this list. docs/glossary.md explains the terms.
 
 ================  ======================================================================================================
-`samples`         arrays of samples from a bag or a topic; also constants, units, settings, errors
-`reference`       where the IMU truly was: table and joints become attitude, rate, angular acceleration, specific force
-`navigation`      strapdown integration: effect of calibration errors in use
-`segmentation`    a stream becomes windows: static poses, spins, dynamic stretches
+`core`            samples, units, settings, errors, documents, probabilities
+`kinematics`      table and joints become attitude, rate, angular acceleration, specific force; strapdown integration
 `effects`         the catalogue of physical effects, and the sensor model made of it
+`papers`          Avrutov 2017 and Zhang 2017 as printed, with errata
+`preprocessing`   a stream becomes windows: static poses, spins, dynamic stretches; checks of a recording
 `estimation`      windows become a solution: noise, likelihood, least squares, observability
-`preflight`       checks of a recording before estimation
 `simulation`      the model run: profiles of motion, noise, sessions
 `compensation`    the model inverted: corrected samples with their covariance
+`selection`       choice of the effects that the data support, tested on held-out windows; analysis of the residual
 `allan`           the noise of an IMU at rest: Allan curves, their fit with intervals, noise.yaml
-`selection`       choice of the effects that the data support, tested on held-out windows
-`beyond`          residuals that no effect of the catalogue explains: size, place and formula
-`calibration`     the use case: from recordings to a judged document; live sessions, fleets, comparison
-`papers`          Avrutov 2017 and Zhang 2017 as printed, with errata
-`planning`        choice of motions: gain per second, and a lower bound on the time of all plans
-`driving`         execution of motions: trajectories, monitoring of the joints, stops with their reason
-`by_hand`         calibration without a table; the arm between two IMUs
-`exports`         conversion of a calibration to and from formats of other programs, with the loss of each
-`diagnosis`       errors of the model and their causes
+`document`        the calibration file, its verdict, comparison, and conversion to formats of other programs
+`references`      turntable and gravity: gathered data and the equations of calibration by hand
+`calibration`     from recordings to a judged document; live sessions, fleets, diagnosis
+`between_imus`    the arm between two IMUs
+`planning`        choice of motions, a lower bound on the time of all plans, execution with stops and their reason
 `report`          HTML reports
-`files`           atomic writing of files; `resources` finds installed files
 `use_cases`       from files to files: functions of the command line and of notebooks
 `cli`, `nodes`    the command line and the ROS 2 nodes; the package `msg_adapters` handles messages and bags
-`ros2`            the verbs under ``ros2 imu``, and the checks of ``ros2 doctor``
 ================  ======================================================================================================
 """
 

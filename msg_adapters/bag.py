@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
-from imu_calibration.errors import InputError, did_you_mean, shortened
-from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.core.errors import InputError, did_you_mean, shortened
+from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.csv_bag import CsvBag
 from msg_adapters.csv_log import SUFFIXES, is_csv
 from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, ImuDecoder, JointDecoder, taken_counts

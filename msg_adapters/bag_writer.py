@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 from msg_adapters.definitions import TypeDefinition
 from msg_adapters.storages import STORAGES, identifiers
 

@@ -8,7 +8,7 @@ from os import PathLike
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.decode import FrameChoice, in_order

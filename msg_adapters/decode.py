@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, imu_from_rows, imu_row
 from msg_adapters.joint_state import JOINT_STATE_TYPE, decode_joints, find_joint_layout, joint_row, joints_from_rows
 from msg_adapters.layout import Packed, group_by_layout

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 from msg_adapters.bag import open_recording
 from msg_adapters.stamps import clean_name
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
 from msg_adapters.imu import FIELDS, N_DOUBLES
 from msg_adapters.stamps import from_ns
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from imu_calibration.samples import ImuSamples
+from imu_calibration.core.samples import ImuSamples
 from msg_adapters.layout import MessageLayout, Packed, overlapping
 from msg_adapters.stamps import FRAME_OFFSET, MessageError, aligned, clean_name, header_stamp_ns, open_header
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.samples import JointSamples
+from imu_calibration.core.samples import JointSamples
 from msg_adapters.layout import MessageLayout, Packed
 from msg_adapters.stamps import FRAME_OFFSET, MessageError, UnusableMessage, aligned, clean_name, header_stamp_ns, open_header
 

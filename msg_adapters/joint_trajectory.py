@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.errors import InputError
-from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
 from msg_adapters.stamps import NS_PER_S
 
 JOINT_TRAJECTORY_TYPE = 'trajectory_msgs/msg/JointTrajectory'

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.samples import SampleBlock
+from imu_calibration.core.samples import SampleBlock
 from msg_adapters.decode import Decoder, JointDecoder, taken_counts
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed

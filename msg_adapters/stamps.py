@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from imu_calibration.errors import printable
+from imu_calibration.core.errors import printable
 
 NS_PER_S = 1_000_000_000
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.samples import TemperatureSamples
+from imu_calibration.core.samples import TemperatureSamples
 from msg_adapters.layout import MessageLayout, Packed
 from msg_adapters.stamps import FRAME_OFFSET, MessageError, aligned, header_stamp_ns, open_header
 

@@ -15,7 +15,7 @@ def refused(kind, code, *values):
     kind : type
         Class of the error.
     code : str
-        See `imu_calibration.errors.ImuCalibrationError`.
+        See `imu_calibration.core.errors.ImuCalibrationError`.
     values : str or number
         Names and numbers that the text must contain.
 

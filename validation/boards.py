@@ -4,7 +4,7 @@ from itertools import combinations
 
 import numpy as np
 
-from imu_calibration.by_hand.relative_arm import estimate_arm
+from imu_calibration.between_imus.arm import estimate_arm
 from validation.figures import new_figure
 from validation.recordings import BOARD, load, reference
 from validation.section import Section, listed, text

@@ -13,8 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.effects.base import AXES
-from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.use_cases.choices import catalogue_of
 from imu_calibration.use_cases.diagnose import diagnose
 from imu_calibration.use_cases.simulate import replay, simulate

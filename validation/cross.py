@@ -5,11 +5,11 @@ from functools import cache
 
 import numpy as np
 
-from imu_calibration.calibration.decision import HELPS
+from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document.decision import HELPS
 from imu_calibration.effects.lags import FAMILY, total_lags
-from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import SampleBlock
+from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.check import check
 from validation.section import Section, text

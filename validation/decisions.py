@@ -15,10 +15,10 @@ ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
     sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
-from imu_calibration.constants import DEG, MILLI_G  # noqa: E402
-from imu_calibration.errors import ImuCalibrationError  # noqa: E402
-from imu_calibration.reference.table import Table  # noqa: E402
-from imu_calibration.samples import SampleBlock  # noqa: E402
+from imu_calibration.core.constants import DEG, MILLI_G  # noqa: E402
+from imu_calibration.core.errors import ImuCalibrationError  # noqa: E402
+from imu_calibration.core.samples import SampleBlock  # noqa: E402
+from imu_calibration.kinematics.table import Table  # noqa: E402
 from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
 from imu_calibration.use_cases.check import check  # noqa: E402
 from validation.recordings import BY_HAND, data_folder, gravity_of, label, load  # noqa: E402

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from imu_calibration.units import for_people, significant
+from imu_calibration.core.units import for_people, significant
 from validation.command_line import ALL, options_of, run_verb
 from validation.recordings import SHAFT, label, reference
 from validation.section import Section, text

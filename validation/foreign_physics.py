@@ -11,9 +11,9 @@ import time
 
 import numpy as np
 
-from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.compensate import compensate
 from imu_calibration.use_cases.diagnose import diagnose

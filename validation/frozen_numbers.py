@@ -97,7 +97,7 @@ def documents_of(writer, name, bag, *, table, nominal):
 
 def targets():
     """Return the names of the programs that `export` writes, except the binary file of MATLAB."""
-    from imu_calibration.exports.export import all_targets
+    from imu_calibration.document.exports.export import all_targets
     return [name for name in all_targets() if name != 'mat']
 
 

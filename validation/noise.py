@@ -6,9 +6,9 @@ from scipy.special import chdtri
 from imu_calibration.allan.identify import identify_noise, read_rest
 from imu_calibration.allan.moment_fit import Whitener
 from imu_calibration.allan.terms import predicted
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.errors import InputError
-from imu_calibration.samples import SampleBlock
 from validation.recordings import BOARD, label, load
 from validation.section import Section, text
 

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
-from imu_calibration.by_hand.model import unpack
+from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import SampleBlock
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window_finder import MotionGatherer
+from imu_calibration.references.gravity.hand_parameters import unpack
 from imu_calibration.use_cases.calibrate import calibrate
 from validation.hand_peers import imu_calib, imu_tk, norm_fit, six_faces, turned
 from validation.second_opinions import Forward, fit_norm

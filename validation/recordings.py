@@ -5,9 +5,9 @@ from pathlib import Path
 
 import yaml
 
-from imu_calibration.by_hand.workflow import read_imu
-from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.samples import NominalScaling
+from imu_calibration.calibration.hand_workflow import read_imu
+from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.core.samples import NominalScaling
 from msg_adapters.bag import open_recording
 
 ROOT = Path(__file__).resolve().parents[1]

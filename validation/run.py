@@ -15,7 +15,7 @@ if __name__ == '__main__':
     sys.path.insert(0, str(ROOT))
 
 from imu_calibration import __version__  # noqa: E402
-from imu_calibration.errors import ImuCalibrationError  # noqa: E402
+from imu_calibration.core.errors import ImuCalibrationError  # noqa: E402
 from validation.recordings import VARIABLE, data_folder  # noqa: E402
 from validation.section import Section, claims_table, text  # noqa: E402
 

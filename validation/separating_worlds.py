@@ -18,11 +18,11 @@ from itertools import count, islice
 
 import numpy as np
 
-from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.planner import Plan
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import SampleBlock
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.motion_primitives import FACES, pose, pose_deg, swing
 from imu_calibration.use_cases.diagnose import Diagnosed, diagnose

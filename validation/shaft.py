@@ -1,11 +1,11 @@
 """One joint is a table too: a motor shaft with a coarse encoder."""
 
-from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.status import LACKING
-from imu_calibration.documents import from_text
-from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.reference.table import Table
+from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.core.documents import from_text
+from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.estimation.status import LACKING
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.options import CalibrationOptions
 from msg_adapters.bag import open_recording
 from validation.recordings import SHAFT
 from validation.section import Section, text

@@ -8,10 +8,10 @@ from unittest import mock
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.reference.joint import Joint
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, JointSamples
+from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.core.samples import ImuSamples, JointSamples
+from imu_calibration.kinematics.joint import Joint
+from imu_calibration.kinematics.table import Table
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 from validation.figures import new_figure

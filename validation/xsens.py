@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from imu_calibration.by_hand.calibrate import calibrate_by_hand
-from imu_calibration.by_hand.options import HandOptions
-from imu_calibration.segmentation.static_detector import find_still
+from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
+from imu_calibration.references.gravity.hand_options import HandOptions
 from validation.recordings import gravity_of, load, nominal_of, reference
 from validation.section import Section, listed, text
 

@@ -9,8 +9,8 @@ import numpy as np
 from imu_calibration.allan.deviation import AllanSums, averaging_factors
 from imu_calibration.allan.still_parts import StillPart
 from imu_calibration.allan.trends import AxisTrend, Parts, TrendReference
-from imu_calibration.samples import NominalScaling, SampleBlock
-from imu_calibration.segmentation.block_cleaning import BlockCleaner
+from imu_calibration.core.samples import NominalScaling, SampleBlock
+from imu_calibration.preprocessing.block_cleaning import BlockCleaner
 
 REGULAR = 0.2
 """Largest typical departure of steps from the period, in periods, up to which a single step is believed."""

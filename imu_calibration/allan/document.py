@@ -7,9 +7,9 @@ import numpy as np
 from imu_calibration.allan.figures import HORIZON, AxisFigures, NoiseFigures, TrendFigure
 from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, WEAK, Term
-from imu_calibration.documents import finite, from_text, to_text
+from imu_calibration.core.documents import finite, from_text, to_text
+from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.errors import DocumentError, InputError
 
 FORMAT = 'imu_calibration/noise/1'
 UNITS = {

@@ -16,10 +16,10 @@ from imu_calibration.allan.scale_covariance import ScaleCovariance
 from imu_calibration.allan.still_parts import LeftOut, StillPart, Survey, still_parts, survey
 from imu_calibration.allan.terms import DETERMINED, LEAST_SCALES, AxisNoise, identify_axis
 from imu_calibration.allan.trends import MOST_BLOCKS, AxisTrend, Blocks, TrendSearch
-from imu_calibration.chances import f_sf
+from imu_calibration.core.distributions import f_sf
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import NominalScaling, SampleBlock
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.errors import InputError
-from imu_calibration.samples import NominalScaling, SampleBlock
 
 CYCLES = 64
 """Cycles of the hump's frequency in a segment: a resonance of quality below 16 is wider than the neighbouring ordinates of the test."""

@@ -9,9 +9,9 @@ from imu_calibration.allan.document import TERMS, UNITS
 from imu_calibration.allan.figures import HORIZON, SLOW, AxisFigures, NoiseFigures
 from imu_calibration.allan.processes import RANDOM_WALK, WHITE, NoiseProcess, mean_covariance
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, WEAK, Term
-from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.core.units import NOISE, for_people, significant
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
-from imu_calibration.units import NOISE, for_people, significant
 
 FINEST, MOST_BLOCKS = 150, 1000
 """Blocks of the run at most, and of alignment and run together."""

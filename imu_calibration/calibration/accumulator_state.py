@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.gathered import Gathered
-from imu_calibration.calibration.held_out import HeldOut, HeldOutBlock
 from imu_calibration.calibration.model_changes import Demand
+from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
+from imu_calibration.core.regular_files import load_arrays
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.estimation.accumulator import Accumulator, WindowBlock
 from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics
-from imu_calibration.reference.joint import JointNames
-from imu_calibration.regular_files import load_arrays
+from imu_calibration.kinematics.joint import JointNames
+from imu_calibration.references.turntable.gathered import Gathered
+from imu_calibration.references.turntable.held_out import HeldOut, HeldOutBlock
 
 FORMAT = 'imu_calibration/accumulator/2'
 _MODEL = ('accelerometer', 'gyroscope', 'reference')

@@ -13,26 +13,26 @@ from functools import partial
 
 import numpy as np
 
-from imu_calibration.beyond.inquiry import inquire
-from imu_calibration.beyond.unexplained import biases_off
-from imu_calibration.calibration.calibrate import conclude, solve_recordings
-from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.model_changes import Demand, ModelChanges
-from imu_calibration.calibration.options import CalibrationOptions, choose_model
-from imu_calibration.calibration.plausibility import one_significant
+from imu_calibration.calibration.table_calibration import conclude, solve_recordings
 from imu_calibration.calibration.table_result import TableResult
-from imu_calibration.chances import chi2_sf
+from imu_calibration.core.distributions import chi2_sf
+from imu_calibration.document.plausibility import one_significant
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import BARE, SensorModel
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import SURE, Solution
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.options import CalibrationOptions, choose_model
+from imu_calibration.references.turntable.extended_model import extended_solution
+from imu_calibration.references.turntable.gathered import Gathered
 from imu_calibration.selection.evidence import LEAST_WINDOWS
-from imu_calibration.selection.extended_model import extended_solution
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.questions import Question
+from imu_calibration.selection.residual_analysis import inquire
 from imu_calibration.selection.search import FAMILY_WISE
+from imu_calibration.selection.unexplained import biases_off
 
 Solved = tuple[Solution, Gathered, SensorModel]
 """A solution, the data that it was solved from, and the model of their columns."""

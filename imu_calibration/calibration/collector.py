@@ -6,19 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.calibration.gathered import KEPT_POSES, KEPT_SAMPLES, Gathered, naming
-from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.core.samples import NominalScaling, SampleBlock
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.window_statistics import WindowStatistics, joined_motion, reduce_window
-from imu_calibration.estimation.window_store import WindowStore, owned_window
-from imu_calibration.preflight.checks import Preflight
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import NominalScaling, SampleBlock
-from imu_calibration.segmentation.block_cleaning import Watcher
-from imu_calibration.segmentation.window import Window, WindowSettings
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.block_cleaning import Watcher
+from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.window import Window, WindowSettings
+from imu_calibration.preprocessing.window_finder import MotionGatherer
+from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.gathered import KEPT_POSES, KEPT_SAMPLES, Gathered, naming
+from imu_calibration.references.turntable.window_store import WindowStore, owned_window
 
 
 class Collector:

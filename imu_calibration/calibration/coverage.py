@@ -8,13 +8,13 @@ import numpy as np
 
 from imu_calibration.calibration.effect_states import GroupState
 from imu_calibration.calibration.from_solution import possible_motions
-from imu_calibration.calibration.status import DETERMINED, LACKING
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.observability import added_information
 from imu_calibration.estimation.prior import GAUGE_SD, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.standard_motions import MOTIONS, rest_with_up
+from imu_calibration.estimation.status import DETERMINED, LACKING
 
 DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)])
 """Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""

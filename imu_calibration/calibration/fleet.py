@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
-from imu_calibration.calibration.decision import decisions_text
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_text import calibration_to_text
-from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult, exit_code
-from imu_calibration.calibration.status import HELD
+from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.decision import decisions_text
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.errors import ImuCalibrationError, InputError
-from imu_calibration.reference.table import Table
+from imu_calibration.estimation.status import HELD
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.options import CalibrationOptions
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 
 import imu_calibration
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.calibration.model_changes import ModelChanges
-from imu_calibration.calibration.status import reasons_held, statuses
-from imu_calibration.calibration.uncorrected import Uncorrected
-from imu_calibration.calibration.verdict import judged
-from imu_calibration.documents import finite
+from imu_calibration.core.documents import finite
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.uncorrected import Uncorrected
+from imu_calibration.document.verdict import judged
 from imu_calibration.effects.applied import centred
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation import observability
@@ -22,10 +20,12 @@ from imu_calibration.estimation.covariance_terms import GRAVITY, replace_weak, w
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.standard_motions import Motion, motions_about
-from imu_calibration.preflight.checks import unusable, warnings
-from imu_calibration.preflight.evidence import CheckFinding
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window_cutter import dropped
+from imu_calibration.estimation.status import reasons_held, statuses
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.checks import unusable, warnings
+from imu_calibration.preprocessing.recording_evidence import CheckFinding
+from imu_calibration.preprocessing.window_cutter import dropped
+from imu_calibration.references.turntable.gathered import Gathered
 
 
 def motions_needed(solution: Solution, tolerances: np.ndarray, table: Table) -> dict[str, tuple[str, float]]:

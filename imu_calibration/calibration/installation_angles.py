@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.core.samples import NominalScaling
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import Role
-from imu_calibration.samples import NominalScaling
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,27 +6,27 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.calibration import accumulator_state
-from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.collector import LiveCollector, columns_at, copied
 from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, table_coverage
 from imu_calibration.calibration.effect_states import GroupState, group_states, waiting_groups
-from imu_calibration.calibration.gathered import Gathered, merge
-from imu_calibration.calibration.linearisation import linearise_again
 from imu_calibration.calibration.live_snapshot import LiveSnapshot
 from imu_calibration.calibration.model_changes import Demand
-from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SessionStatus, TableSession
+from imu_calibration.calibration.table_calibration import conclude
 from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import InputError
 from imu_calibration.estimation.accumulator import selected_columns
-from imu_calibration.estimation.window_store import WindowStore
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, SampleBlock
-from imu_calibration.segmentation.stamping import StampLine
-from imu_calibration.segmentation.window import Window, WindowSettings
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.stamping import StampLine
+from imu_calibration.preprocessing.window import Window, WindowSettings
+from imu_calibration.references.options import CalibrationOptions, choose_model
+from imu_calibration.references.turntable.gathered import Gathered, merge
+from imu_calibration.references.turntable.window_store import WindowStore
+from imu_calibration.selection.linearisation import linearise_again
 
 HELD_BACK = 200
 """Blocks that wait for the first temperature at most, when a thermal effect needs one."""

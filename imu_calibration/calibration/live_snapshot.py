@@ -4,15 +4,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from imu_calibration.calibration.by_evidence import EvidentSolution, Solved, ask_kept, solve_by_evidence
-from imu_calibration.calibration.calibrate import solve_gathered
-from imu_calibration.calibration.gathered import Gathered
-from imu_calibration.calibration.linearisation import PASSES, linearise_again
 from imu_calibration.calibration.model_changes import Demand
-from imu_calibration.calibration.options import CalibrationOptions, choose_model
+from imu_calibration.calibration.table_calibration import solve_gathered
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.window_store import WindowStore
-from imu_calibration.preflight.joint_checks import check_units
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.joint_checks import check_units
+from imu_calibration.references.options import CalibrationOptions, choose_model
+from imu_calibration.references.turntable.gathered import Gathered
+from imu_calibration.references.turntable.window_store import WindowStore
+from imu_calibration.selection.linearisation import PASSES, linearise_again
 
 
 @dataclass(frozen=True, eq=False)

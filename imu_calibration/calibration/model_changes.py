@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.estimation.covariance_terms import REJECTED, with_term
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.references.options import CalibrationOptions
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.held_out import HeldOut
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.applied import Centre, applied_values
 from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
 from imu_calibration.effects.forward_equations import coefficients
@@ -20,7 +19,8 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.attitudes import one_attitude
 from imu_calibration.estimation.pieces import AXES, PIECE_TIME, Regime
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable.held_out import HeldOut
 
 RESAMPLES = 1000
 """Resamples of complete blocks for an interval."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.segmentation.window import Window
+from imu_calibration.preprocessing.window import Window
 
 LONGEST = 1024
 """Most samples of a segment: a finer resolution than that of a recording of a minute is not useful."""

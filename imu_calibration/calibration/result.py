@@ -6,16 +6,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from imu_calibration.calibration.decision import HELPS, most_cautious
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.gathered import Gathered
-from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.statements import Verdict
-from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.calibration.trust import usage
-from imu_calibration.constants import ARCMIN
-from imu_calibration.segmentation.window import Window
-from imu_calibration.settings import setting
+from imu_calibration.core.constants import ARCMIN
+from imu_calibration.core.settings import setting
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.decision import HELPS, most_cautious
+from imu_calibration.document.statements import Verdict
+from imu_calibration.document.trust import usage
+from imu_calibration.estimation.status import DETERMINED
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.gathered import Gathered
 
 
 @dataclass(frozen=True, eq=False)

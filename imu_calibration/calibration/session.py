@@ -1,4 +1,4 @@
-"""Common interface of live calibrations: on a table `calibration.live`, by hand `by_hand.live`."""
+"""Common interface of live calibrations: on a table `live`, by hand `live_poses`."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -9,15 +9,15 @@ from imu_calibration.calibration.coverage import Coverage
 from imu_calibration.calibration.effect_states import GroupState, Progress
 from imu_calibration.calibration.live_snapshot import LiveSnapshot
 from imu_calibration.calibration.model_changes import Demand
-from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_result import TableResult
-from imu_calibration.reference.earth import local_gravity
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, SampleBlock
-from imu_calibration.segmentation.stamping import StampLine
-from imu_calibration.segmentation.window import WindowSettings
-from imu_calibration.settings import setting
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.core.settings import setting
+from imu_calibration.kinematics.earth import local_gravity
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.stamping import StampLine
+from imu_calibration.preprocessing.window import WindowSettings
+from imu_calibration.references.options import CalibrationOptions
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from imu_calibration.calibration.held_out import HeldOut, HeldOutBlock
 from imu_calibration.calibration.proof import nominal_values
 from imu_calibration.calibration.result import CalibrationResult, ErrorBudget, ReferenceErrors, WindowErrors
-from imu_calibration.constants import ARCMIN
+from imu_calibration.core.constants import ARCMIN
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import References, columns, warped_reference
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients, predict, sensor_output
@@ -26,10 +25,11 @@ from imu_calibration.estimation.prior import fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.whitening import Whitening
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.perturbed_table import tilt
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.perturbed_table import tilt
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.turntable.held_out import HeldOut, HeldOutBlock
 
 MOVING_SAMPLES = 20_000
 """Most samples of moving windows that are used; they are subsampled evenly beyond it."""

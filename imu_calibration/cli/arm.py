@@ -4,7 +4,7 @@ from argparse import Namespace
 
 from imu_calibration.cli.arguments import BAG
 from imu_calibration.cli.parser import OneLineParser, VerbResult
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 
 EXAMPLES = ('session --imu-topic /imu_a/data_raw --imu-topic /imu_b/data_raw',
             'session --imu-topic /imus --frame-id front --imu-topic /imus --frame-id rear')
@@ -20,11 +20,11 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Estimate and print."""
-    from imu_calibration.by_hand.relative_arm import estimate_arm
-    from imu_calibration.by_hand.workflow import read_imu
+    from imu_calibration.between_imus.arm import estimate_arm
+    from imu_calibration.calibration.hand_workflow import read_imu
     from imu_calibration.cli.show import console, warn
-    from imu_calibration.preflight.checks import Preflight, warnings
-    from imu_calibration.units import with_sd
+    from imu_calibration.core.units import with_sd
+    from imu_calibration.preprocessing.checks import Preflight, warnings
     from imu_calibration.use_cases.recordings import Topics, open_bag, source_of
     if len(options.imu_topic) != 2:
         raise InputError(f'--imu-topic must be given twice, A and B, got {len(options.imu_topic)}; name both IMUs')

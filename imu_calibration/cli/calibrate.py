@@ -26,9 +26,9 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Calibrate into a folder that can be written, print the verdict, return the exit code."""
-    from imu_calibration import files
-    from imu_calibration.calibration.document_text import to_mapping
     from imu_calibration.cli.show import show_calibration, warn
+    from imu_calibration.document import files
+    from imu_calibration.document.calibration_text import to_mapping
     from imu_calibration.use_cases.calibrate import calibrate
     arguments.require_place(options, 'calibrate', options.bags)
     with files.output_folder(options.output) as folder:

@@ -20,10 +20,10 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Print the errors before and after with their interval and the decision; exit code 0 when it helps each sensor, otherwise 3."""
-    from imu_calibration.calibration.decision import ratio_text
     from imu_calibration.cli.show import console, show_table, warn
-    from imu_calibration.preflight.checks import warnings
-    from imu_calibration.units import error_text
+    from imu_calibration.core.units import error_text
+    from imu_calibration.document.decision import ratio_text
+    from imu_calibration.preprocessing.checks import warnings
     from imu_calibration.use_cases.check import check
     found = check(options.bag, options.calibration, stand_of(options), **choices_of(options))
     warn([finding.to_mapping() for finding in warnings(found.result.findings)])

@@ -15,10 +15,9 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Compare and print."""
-    from imu_calibration import files
-    from imu_calibration.calibration import comparison
     from imu_calibration.cli.show import console, show_table
-    from imu_calibration.units import for_people, with_sd
+    from imu_calibration.core.units import for_people, with_sd
+    from imu_calibration.document import comparison, files
     result = comparison.compare(files.read_calibration(options.first), files.read_calibration(options.second))
     out = console()
     numbers = ('A', 'B', 'B - A', 'combined sd', 'in sd')

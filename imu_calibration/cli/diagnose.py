@@ -23,8 +23,8 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Diagnose into a folder that can be written, print the findings, return the exit code."""
-    from imu_calibration import files
     from imu_calibration.cli.show import console, warn
+    from imu_calibration.document import files
     from imu_calibration.use_cases.diagnose import diagnose
     from imu_calibration.use_cases.foxglove_file import foxglove
     if options.mcap:

@@ -4,7 +4,7 @@ from argparse import Namespace
 
 from imu_calibration.cli.arguments import add_stand_arguments, add_topic_arguments, stand_of
 from imu_calibration.cli.parser import OneLineParser, VerbResult
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 
 EXAMPLES = ('--list', 'result/calibration.yaml --to kalibr --noise noise/noise.yaml --output imu.yaml')
 
@@ -47,7 +47,7 @@ def run(options: Namespace) -> VerbResult:
 
 def _show_targets():
     from imu_calibration.cli.show import console, show_table
-    from imu_calibration.exports.export import all_targets, holds_in_words
+    from imu_calibration.document.exports.export import all_targets, holds_in_words
     rows = [(target.name, target.title, holds_in_words(target), target.noise_is or '-', 'yes' if target.read else '-')
             for target in all_targets().values() if target.write is not None]
     show_table(console(), ('name', 'file', 'of the calibration it holds', 'noise', 'read'), rows)

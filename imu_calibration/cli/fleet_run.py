@@ -9,19 +9,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from imu_calibration import files
-from imu_calibration.calibration.decision import HARMS, HELPS, UNPROVEN
 from imu_calibration.calibration.fleet import FleetStep, Spread, Unit, UnitResult, fleet_exit_code, summarise
-from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.cli.arguments import choices_of, stand_of
 from imu_calibration.cli.parser import VerbResult, hints_of
 from imu_calibration.cli.show import console, show_table, warn
-from imu_calibration.errors import InputError, with_hint
-from imu_calibration.progress import counter
-from imu_calibration.reference.joint import JointNames
+from imu_calibration.core.errors import InputError, with_hint
+from imu_calibration.core.progress import counter
+from imu_calibration.core.units import for_people, significant, with_sd
+from imu_calibration.document import files
+from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN
+from imu_calibration.kinematics.joint import JointNames
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.calibration_page import calibration_report
 from imu_calibration.report.page import render
-from imu_calibration.units import for_people, significant, with_sd
 from imu_calibration.use_cases.choices import topics_of
 from imu_calibration.use_cases.pool import cluster_mapper, jobs_for, process_mapper
 from imu_calibration.use_cases.provenance import provenance_with

@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 from imu_calibration.cli.arguments import BAG, add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
 from imu_calibration.cli.parser import OneLineParser, VerbResult, hints_of
-from imu_calibration.errors import ImuCalibrationError, with_hint
+from imu_calibration.core.errors import ImuCalibrationError, with_hint
 
 EXAMPLES = ('session', 'session --table table.yaml')
 TOPICS = (('imu_topic', 'imu'), ('joint_topic', 'joints'), ('temperature_topic', 'temperature'))
@@ -22,7 +22,7 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Namespace) -> VerbResult:
     """Read each Imu topic and print its properties; with a table also the motions and the parameters that they determine."""
     from imu_calibration.cli.show import console, show_findings
-    from imu_calibration.preflight.checks import refuse
+    from imu_calibration.preprocessing.checks import refuse
     from imu_calibration.use_cases.choices import calibration_options, topics_of
     from imu_calibration.use_cases.inspect import imu_topics_of, inspect
     from imu_calibration.use_cases.recordings import Topics, existing

@@ -31,8 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(options: Namespace) -> int:
     """Run the verb that was parsed and print its document if --json is given; return the exit code."""
     from imu_calibration.cli.parser import hints_of
-    from imu_calibration.errors import ImuCalibrationError, printable
-    from imu_calibration.progress import listening
+    from imu_calibration.core.errors import ImuCalibrationError, printable
+    from imu_calibration.core.progress import listening
     prog = f'imu_calibration {options.verb}'
     try:
         with contextlib.ExitStack() as stack:

@@ -27,8 +27,8 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Identify into a folder that can be written, print the figures, return the exit code."""
-    from imu_calibration import files
     from imu_calibration.allan.document import to_mapping
+    from imu_calibration.document import files
     from imu_calibration.use_cases.noise import noise
     chosen = {} if options.horizon is None else {'horizon': options.horizon}
     with files.output_folder(options.output) as folder:

@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any, NamedTuple, NoReturn
 
 import imu_calibration
-from imu_calibration.errors import KEYS, did_you_mean
+from imu_calibration.core.errors import KEYS, did_you_mean
 
 VERBS = {
     'inspect': 'Topics, rates, gaps, stamps, suspicious units and axes, motions found, and the parameters that the recording determines.',

@@ -5,7 +5,7 @@ from textwrap import fill
 
 from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, stand_of
 from imu_calibration.cli.parser import OneLineParser, VerbResult
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
 
@@ -46,9 +46,9 @@ def run(options: Namespace) -> VerbResult:
     if options.by_hand and options.motion == 'any':
         return _run_by_hand(options)
     stand = _stand(options)
-    from imu_calibration import files
+    from imu_calibration.core.progress import report
+    from imu_calibration.document import files
     from imu_calibration.planning.planner import plan_to_mapping
-    from imu_calibration.progress import report
     from imu_calibration.use_cases.plan import plan
     with files.output_folder(options.output) as folder:
         made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate,
@@ -62,8 +62,8 @@ def run(options: Namespace) -> VerbResult:
 
 
 def _run_by_hand(options):
-    from imu_calibration import files
-    from imu_calibration.by_hand.hand_plan import hand_plan_to_mapping
+    from imu_calibration.document import files
+    from imu_calibration.planning.hand_plan import hand_plan_to_mapping
     from imu_calibration.use_cases.plan import by_hand, hand_summary
     with files.output_folder(options.output) as folder:
         made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **{name: getattr(options, name) for name in CHOICES})

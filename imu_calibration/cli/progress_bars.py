@@ -6,7 +6,7 @@ from typing import Any
 
 
 class ProgressBars:
-    """Listens to `imu_calibration.progress`; one bar per phase, removed at the end."""
+    """Listens to `imu_calibration.core.progress`; one bar per phase, removed at the end."""
 
     def __init__(self, *, verbose: bool = False):
         self._verbose, self._tasks = verbose, {}

@@ -4,10 +4,10 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from imu_calibration.calibration.document import HEADINGS, NUMBERS, parameter_rows
 from imu_calibration.calibration.result import summary
-from imu_calibration.errors import printable, with_hint
-from imu_calibration.preflight.evidence import CheckFinding, Severity
+from imu_calibration.core.errors import printable, with_hint
+from imu_calibration.document.calibration import HEADINGS, NUMBERS, parameter_rows
+from imu_calibration.preprocessing.recording_evidence import CheckFinding, Severity
 
 if TYPE_CHECKING:
     from imu_calibration.use_cases.calibrate import Calibrated

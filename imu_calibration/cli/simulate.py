@@ -4,7 +4,7 @@ from argparse import Namespace
 
 from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, add_topic_arguments, stand_of
 from imu_calibration.cli.parser import OneLineParser, VerbResult
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
 

@@ -24,8 +24,8 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Write the file, print the layout to open it with and the missing parts; return the exit code."""
-    from imu_calibration.resources import config_file
     from imu_calibration.use_cases.foxglove_file import foxglove
+    from imu_calibration.use_cases.resources import config_file
     from imu_calibration.use_cases.view import view
     foxglove()   # before the work, not after it
     layout = config_file('view.foxglove.json')

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from imu_calibration.cli.parser import OneLineParser, VerbResult
-from imu_calibration.errors import InputError, printable
+from imu_calibration.core.errors import InputError, printable
 
 EXAMPLES = ('', '--node /lab/calibration_node --once')
 GONE = 5.0

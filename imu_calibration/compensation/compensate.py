@@ -8,11 +8,11 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import InputError
-from imu_calibration.reference.reference_motion import Reference, lever_matrix
+from imu_calibration.kinematics.reference_motion import Reference, lever_matrix
 
 
 class FittedErrors(Protocol):
@@ -164,9 +164,9 @@ def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarra
     temperature_c : ndarray, shape (n,), optional
         Needed when the calibration has thermal effects.
     thermal_branch : ndarray, shape (n,), optional
-        Thermal branch (`reference.signal_history`); zero if not given.
+        Thermal branch (`kinematics.signal_history`); zero if not given.
     vibration : ndarray, shape (n, 3), optional
-        How much it vibrates (`reference.signal_history`), (m/s^2)^2; zero where not given.
+        How much it vibrates (`kinematics.signal_history`), (m/s^2)^2; zero where not given.
     transfer : Transfer, optional
         Point and frame to move to: ``f_target = f_s - (alpha x r + omega x (omega x r))``.
 

@@ -11,7 +11,7 @@ from imu_calibration.compensation.rate_slope import SlopeError
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import columns_at_point
 from imu_calibration.effects.forward_equations import coefficients_at_point
-from imu_calibration.reference.reference_motion import Reference
+from imu_calibration.kinematics.reference_motion import Reference
 
 STEPS = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-2] * 3)
 """Steps of the central differences in force, rate and derivative of the rate: small against the curvature, large against rounding."""
@@ -115,9 +115,9 @@ class Uncertainty:
         dt : float
             Temperature above the calibration's reference temperature, K.
         branch : float
-            Thermal branch (`reference.signal_history`).
+            Thermal branch (`kinematics.signal_history`).
         vibration : tuple of 3 floats
-            How much it vibrates (`reference.signal_history`), (m/s^2)^2.
+            How much it vibrates (`kinematics.signal_history`), (m/s^2)^2.
         slope_error : rate_slope.SlopeError, optional
             Error of the derivative; None: noise only.
 

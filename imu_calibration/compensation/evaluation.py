@@ -7,13 +7,13 @@ import numpy as np
 
 from imu_calibration.compensation.compensate import FittedErrors
 from imu_calibration.compensation.stream import CompensationStream
-from imu_calibration.navigation import drift_over
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.reference_motion import Reference
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, SampleBlock
-from imu_calibration.segmentation.window import WindowSettings
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.strapdown import drift_over
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import WindowSettings
+from imu_calibration.preprocessing.window_finder import MotionGatherer
 
 
 @dataclass(frozen=True, eq=False)

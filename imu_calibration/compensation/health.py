@@ -9,8 +9,8 @@ import numpy as np
 from imu_calibration.compensation.compensate import FittedErrors, Transfer
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.compensation.stops import BLOCK, Stop, StopDetector
-from imu_calibration.constants import DEG, STANDARD_GRAVITY
-from imu_calibration.units import unit_of_rest
+from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.core.units import unit_of_rest
 
 EARTH_RATE = 7.292e-5
 """rad/s; a gyroscope at rest measures it about axes that are unknown here."""

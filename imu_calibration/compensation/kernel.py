@@ -12,11 +12,11 @@ from collections.abc import Callable
 import numpy as np
 
 from imu_calibration.compensation.compensate import CONVERGED, ITERATIONS, FittedErrors, Transfer, invertible_values
+from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.effects.expressions import SCALAR_FUNCTIONS, added, as_text, scaled
 from imu_calibration.effects.forward_equations import coefficients_at_point
 from imu_calibration.effects.regressors import LEVER
-from imu_calibration.errors import InputError
 
 SETTLED = 1e-13
 """Sum of the changes in one fixed-point step (m/s^2, rad/s) below which the iteration has converged."""
@@ -33,7 +33,7 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch, sx, sy, sz) -> (fx, fy, fz, wx, wy, wz)`` reads the measured specific
     force (m/s^2) and rate (rad/s), the derivative of the *measured* rate (rad/s^2; it is multiplied by the inverse gyroscope matrix here),
     and the temperature above the calibration's reference temperature (K). Where they are left out, which way that came
-    (`reference.signal_history`) and how much it vibrates (`reference.signal_history`, (m/s^2)^2) are 0.
+    (`kinematics.signal_history`) and how much it vibrates (`reference.signal_history`, (m/s^2)^2) are 0.
     Where the non-linear effects cannot be undone it returns NaN.
 
     Parameters

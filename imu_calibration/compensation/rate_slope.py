@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.compensation.angular_acceleration import EARLY, LATE, RESET_NS, CausalDerivative, StampedDerivative, TimedDerivative
-from imu_calibration.segmentation.stamping import COUNTED, IRREGULAR, LAG, LEAST, PAUSE_NS, REGULAR, StampLine, describe_stamps
+from imu_calibration.preprocessing.stamping import COUNTED, IRREGULAR, LAG, LEAST, PAUSE_NS, REGULAR, StampLine, describe_stamps
 
 BLOCK = LAG
 """The stamps are classified again after this many samples."""

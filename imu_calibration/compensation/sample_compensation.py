@@ -12,7 +12,7 @@ from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.rate_slope import NO_SLOPE, RateSlope
 from imu_calibration.compensation.stream import derivative_for, uses_slope
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.reference.signal_history import BandVariance, ThermalBranch
+from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch
 
 
 class SampleCompensation:

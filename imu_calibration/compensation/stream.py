@@ -11,11 +11,11 @@ from imu_calibration.compensation.angular_acceleration import CausalDerivative, 
 from imu_calibration.compensation.compensate import Corrected, FittedErrors, Transfer, arms_of, compensate, invertible, outside_conditions
 from imu_calibration.compensation.covariance import Uncertainty, is_known
 from imu_calibration.compensation.rate_slope import WITHOUT, RateSlope
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.effects.base import Role
-from imu_calibration.errors import InputError
-from imu_calibration.reference.signal_history import BandVariance, ThermalBranch
-from imu_calibration.samples import ImuSamples, TemperatureSamples
-from imu_calibration.segmentation.stamping import REGULAR, StampLine, describe_stamps
+from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch
+from imu_calibration.preprocessing.stamping import REGULAR, StampLine, describe_stamps
 
 CORRECTED_TOPIC_ENDINGS = ('data_corrected', 'corrected')
 """A topic with this ending is refused, because a second correction would be wrong."""

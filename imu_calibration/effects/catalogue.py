@@ -5,12 +5,12 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
+from imu_calibration.core.errors import InputError, did_you_mean, shortened
 from imu_calibration.effects.base import SECTIONS, Effect
 from imu_calibration.effects.reference_effects import reference_effects
 from imu_calibration.effects.sensor_effects import ACCELEROMETER, GYROSCOPE
 from imu_calibration.effects.term import from_definition
-from imu_calibration.errors import InputError, did_you_mean, shortened
-from imu_calibration.reference.joint import JointNames
+from imu_calibration.kinematics.joint import JointNames
 
 JOINTS = ('outer', 'middle', 'inner')
 """Default joint names."""

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.core.errors import InputError
 from imu_calibration.effects.expressions import PLACES, QUANTITY_OF, Sum, array_function, may_fail, names_in, products, read
-from imu_calibration.errors import InputError
-from imu_calibration.reference.reference_motion import Reference
+from imu_calibration.kinematics.reference_motion import Reference
 
 STEP = 1e-30
 """Complex step of the derivative by a time constant."""

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import Effect, Role
 from imu_calibration.effects.sensor_model import WARP, SensorModel
-from imu_calibration.errors import InputError
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.reference_motion import Reference, lever_matrix
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.reference_motion import Reference, lever_matrix
+from imu_calibration.kinematics.table import Table
 
 
 def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,

@@ -13,7 +13,7 @@ from typing import cast
 
 import numpy as np
 
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 
 MOST_JOINTS = 7
 """Largest number of joints in a column."""

@@ -7,9 +7,9 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.columns import columns_at_point, warped_reference
 from imu_calibration.effects.sensor_model import WARP, WARP_LEVER, SensorModel
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.reference_motion import Reference
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.table import Table
 
 
 def coefficients(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:

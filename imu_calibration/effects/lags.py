@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS, SHORT, Effect
-from imu_calibration.reference.joint_motion import JointMotion, shifted
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.joint_motion import JointMotion, shifted
+from imu_calibration.kinematics.table import Table
 
 FIRST_ORDER = tuple(zip(*reversed(np.polynomial.laguerre.laggauss(5))))
 """(weight, delay) pairs that make an exponential lag a weighted mean of delays: int e^-x f(t - tau x) dx."""

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.core.constants import STANDARD_GRAVITY
 from imu_calibration.effects.base import MATRIX, Effect, Role
 from imu_calibration.effects.lags import LAGS
 from imu_calibration.effects.regressors import ATTITUDE, LOAD, PAIRS
-from imu_calibration.reference.joint import JointNames
-from imu_calibration.reference.joint_motion import shifted, with_encoder_harmonics
-from imu_calibration.reference.perturbed_table import WOBBLES, tilt, with_axis_angles, with_axis_places, with_sag, with_wobble
+from imu_calibration.kinematics.joint import JointNames
+from imu_calibration.kinematics.joint_motion import shifted, with_encoder_harmonics
+from imu_calibration.kinematics.perturbed_table import WOBBLES, tilt, with_axis_angles, with_axis_places, with_sag, with_wobble
 
 EVEN_AND_ODD = [(i, j, k, 1.0 if (j - i) % 3 == 1 else -1.0) for i in range(3) for j in range(3) for k in range(3) if len({i, j, k}) == 3]
 """Axes i, j, k of a cross product with their sign."""

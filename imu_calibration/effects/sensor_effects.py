@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.constants import DEG, MILLI_G, STANDARD_GRAVITY
+from imu_calibration.core.constants import DEG, MILLI_G, STANDARD_GRAVITY
 from imu_calibration.effects import regressors
 from imu_calibration.effects.base import AXES, MATRIX, OTHERS, PRODUCTS, SHORT, UNIT, VECTOR, Effect, Role
 from imu_calibration.effects.coefficients import AlongAxis, Amplitudes, LeverArms, OfMatrix, OfOthers, Products

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SECTIONS, SENSORS, Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
-from imu_calibration.errors import InputError
-from imu_calibration.reference.joint import JointNames
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.joint import JointNames
+from imu_calibration.kinematics.table import Table
 
 BASE = ('bias', 'matrix')
 """Effects that every sensor has."""

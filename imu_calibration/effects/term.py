@@ -5,10 +5,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import AXES, SENSORS, VECTOR, Effect
 from imu_calibration.effects.coefficients import Amplitudes
 from imu_calibration.effects.column_group import ColumnGroup
-from imu_calibration.errors import InputError
 
 JOINTS = {'joint angle', 'joint rate'}
 """Quantities that exist only with a table."""

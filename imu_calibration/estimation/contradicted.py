@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.chances import chance_of_fall
+from imu_calibration.core.distributions import chance_of_fall
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.chances import chi2_sf, f_sf
+from imu_calibration.core.distributions import chi2_sf, f_sf
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
 from imu_calibration.estimation.covariance_terms import DRIFT, MODEL_ERROR

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import NotObservableError
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.attitudes import not_separable
 from imu_calibration.estimation.contradicted import contradicted

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.constants import DEG, STANDARD_GRAVITY
-from imu_calibration.reference.reference_motion import Reference
-from imu_calibration.reference.signal_history import ThermalBranch
+from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.signal_history import ThermalBranch
 
 REST, WAY = 5.0, 3.0
 """s; a rest, and the time from one rest to the next."""

@@ -5,15 +5,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from imu_calibration.core.samples import rounding_variance
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.pieces import moving_pieces, pieces_at_rest
 from imu_calibration.estimation.triangular import triangular
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import rounding_variance
-from imu_calibration.segmentation.window import Window
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
 
 SLOW_TIME = 0.25
 """Length of the pieces whose means separate correlated misfit from white noise, s: longer than sensor filters, shorter than motions."""

@@ -2,17 +2,16 @@
 
 from dataclasses import dataclass, replace
 
-from imu_calibration import files
-from imu_calibration.calibration import trust
-from imu_calibration.calibration.comparison import moved_beyond_sd
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_text import calibration_from_text
-from imu_calibration.calibration.trust import with_measured_noise
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.health import CalibrationHealth, HealthOptions, StopWatch
 from imu_calibration.compensation.stream import requested_transfer
-from imu_calibration.documents import version_of
-from imu_calibration.errors import DocumentError, ImuCalibrationError, shortened
+from imu_calibration.core.documents import version_of
+from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
+from imu_calibration.document import files, trust
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_from_text
+from imu_calibration.document.comparison import moved_beyond_sd
+from imu_calibration.document.trust import with_measured_noise
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.static_frames import TOPIC, StaticFrames

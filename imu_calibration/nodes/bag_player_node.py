@@ -8,13 +8,13 @@ import numpy as np
 import rclpy
 from rclpy.node import Node
 
-from imu_calibration import files
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.settings import setting
+from imu_calibration.document import files
 from imu_calibration.nodes.inputs import latched_qos, output_qos
 from imu_calibration.nodes.lifecycle import announce, run_node
 from imu_calibration.nodes.parameters import declare_parameters
 from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
-from imu_calibration.settings import setting
 from msg_adapters.rosbag2 import Rosbag2
 
 PAUSE = 0.01

@@ -3,12 +3,12 @@
 import time
 from collections.abc import Callable, Iterator, Mapping
 
-from imu_calibration.calibration.decision import HARMS
-from imu_calibration.diagnosis import live as diagnosis
+from imu_calibration.calibration.diagnosis import live_diagnosis as diagnosis
+from imu_calibration.document.decision import HARMS
 from imu_calibration.nodes.calibration_state import WorkerState
 from imu_calibration.nodes.complaints import INFO, WARNING
 from imu_calibration.nodes.inputs import MatchedInput
-from imu_calibration.segmentation.stamping import COUNTED, REGULAR
+from imu_calibration.preprocessing.stamping import COUNTED, REGULAR
 
 PATIENCE = 5.0
 """Seconds between two pieces of advice; the most useful motion may change with every solution."""

@@ -19,11 +19,11 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from imu_calibration import files
-from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSession, LiveSettings
+from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.settings import setting
+from imu_calibration.document import files
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.errors import ImuCalibrationError
 from imu_calibration.nodes.calibration_guide import CalibrationGuide
 from imu_calibration.nodes.calibration_status import statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker
@@ -37,10 +37,10 @@ from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of, words_of
 from imu_calibration.nodes.session_files import SessionFiles, reference_of
 from imu_calibration.nodes.worker_requests import Listeners
-from imu_calibration.resources import config_file
-from imu_calibration.segmentation.window import WindowSettings
-from imu_calibration.settings import setting
+from imu_calibration.preprocessing.window import WindowSettings
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.provenance import provenance_with
+from imu_calibration.use_cases.resources import config_file
 from msg_adapters.encode import encode_imu, rows
 from msg_adapters.live import LiveGatherer
 

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, field
 
+from imu_calibration.calibration.diagnosis.live_diagnosis import DiagnosisState
 from imu_calibration.calibration.session import SessionStatus
-from imu_calibration.diagnosis.live import DiagnosisState
-from imu_calibration.preflight.stream_watch import StreamState
+from imu_calibration.preprocessing.stream_watch import StreamState
 
 
 @dataclass(frozen=True)

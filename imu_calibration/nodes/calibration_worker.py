@@ -11,18 +11,18 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from imu_calibration.calibration.coverage import bars_of
-from imu_calibration.calibration.document_text import calibration_to_text
+from imu_calibration.calibration.diagnosis.live_diagnosis import DiagnosisState, question_about
 from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSession, LiveSettings, SolvePacer
-from imu_calibration.calibration.trust import missing
-from imu_calibration.diagnosis.live import DiagnosisState, question_about
-from imu_calibration.errors import ImuCalibrationError, NotObservableError, shortened
+from imu_calibration.core.errors import ImuCalibrationError, NotObservableError, shortened
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.trust import missing
 from imu_calibration.nodes.calibration_state import WorkerState
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
 from imu_calibration.nodes.session_files import SessionFiles
 from imu_calibration.nodes.worker_requests import Listeners, Request
-from imu_calibration.preflight.stream_watch import StreamWatch
-from imu_calibration.segmentation.window import WindowSettings
+from imu_calibration.preprocessing.stream_watch import StreamWatch
+from imu_calibration.preprocessing.window import WindowSettings
 from msg_adapters.live import LiveGatherer
 
 PERIOD = 0.1

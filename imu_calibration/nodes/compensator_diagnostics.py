@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration import trust
-from imu_calibration.calibration.status import LACKING
 from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, MOVED, UNIT, WAITING
-from imu_calibration.constants import HOTTEST_C
+from imu_calibration.core.constants import HOTTEST_C
+from imu_calibration.document import trust
+from imu_calibration.estimation.status import LACKING
 from imu_calibration.nodes.adoption import Adopted
 from imu_calibration.nodes.complaints import REMINDER
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
-from imu_calibration.segmentation.stamping import COUNTED
+from imu_calibration.preprocessing.stamping import COUNTED
 
 SERIOUS = ('frame_id', 'not an Imu message', 'failed')
 """Prefixes of the reasons for which no message of a stream can be corrected."""

@@ -16,11 +16,11 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from imu_calibration import files
 from imu_calibration.compensation.health import HARMS
 from imu_calibration.compensation.stream import refuse_corrected
-from imu_calibration.documents import version_of
-from imu_calibration.errors import DocumentError, ImuCalibrationError, InputError, shortened
+from imu_calibration.core.documents import version_of
+from imu_calibration.core.errors import DocumentError, ImuCalibrationError, InputError, shortened
+from imu_calibration.document import files
 from imu_calibration.nodes import relay_loop
 from imu_calibration.nodes.adoption import Adopted, Awaited, adopt, again, has_moved
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from imu_calibration.errors import InputError
-from imu_calibration.settings import setting
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.settings import setting
 
 FILE, TOPIC, FILE_THEN_TOPIC = 'file', 'topic', 'file_then_topic'
 ADOPT = (FILE, TOPIC, FILE_THEN_TOPIC)

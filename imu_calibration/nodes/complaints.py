@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from imu_calibration.errors import printable
+from imu_calibration.core.errors import printable
 
 INFO, WARNING, ERROR = 'info', 'warning', 'error'
 REMINDER = 60.0

@@ -4,9 +4,9 @@ import threading
 import time
 from collections.abc import Callable
 
+from imu_calibration.calibration.diagnosis.live_diagnosis import FAILED, OFF, Answer, DiagnosisQuestion, DiagnosisState
 from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.session import SolvePacer
-from imu_calibration.diagnosis.live import FAILED, OFF, Answer, DiagnosisQuestion, DiagnosisState
 from imu_calibration.nodes.heap import return_freed_memory
 
 SHARE = 0.2

@@ -14,10 +14,10 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
 from trajectory_msgs.msg import JointTrajectory
 
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
 from imu_calibration.nodes.inputs import node_of, output_qos
 from imu_calibration.nodes.lifecycle import guarded
-from imu_calibration.reference.trajectory_points import TrajectoryPoints
 from msg_adapters.joint_trajectory import encode_trajectory
 
 COMMANDS = ('topic', 'action', 'auto')

@@ -17,10 +17,10 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from imu_calibration.errors import ImuCalibrationError, shortened
+from imu_calibration.core.errors import ImuCalibrationError, shortened
+from imu_calibration.core.settings import describe
 from imu_calibration.nodes.parameter_files import meaning, settings_of, value_text
 from imu_calibration.nodes.parameters import unknown_parameters
-from imu_calibration.settings import describe
 
 WIDTH = 118
 

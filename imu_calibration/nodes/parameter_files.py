@@ -12,7 +12,7 @@ import json
 import textwrap
 from pathlib import Path
 
-from imu_calibration.settings import Setting, describe
+from imu_calibration.core.settings import Setting, describe
 
 NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
 

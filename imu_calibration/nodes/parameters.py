@@ -12,8 +12,8 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 
-from imu_calibration.errors import ImuCalibrationError, InputError
-from imu_calibration.settings import Setting, describe, override
+from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.settings import Setting, describe, override
 
 RETIRED = {'reliable': 'inputs connect as their publishers offer',
            'diagnosis_samples': 'evenly spread windows are used, as in a recording'}

@@ -24,13 +24,13 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from imu_calibration import files
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_text import calibration_from_text
-from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.driving.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect, separator_of
-from imu_calibration.driving.driver import Driver, DriverSettings
-from imu_calibration.errors import ImuCalibrationError, InputError, shortened
+from imu_calibration.core.errors import ImuCalibrationError, InputError, shortened
+from imu_calibration.core.settings import setting
+from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_from_text
+from imu_calibration.kinematics.motion_limits import NOT_CHECKED, MotionLimits, limit_words, limits_of, missing_ranges, range_warnings
+from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import driven_markers
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
@@ -41,14 +41,14 @@ from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.planner_status import drive_statuses
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
+from imu_calibration.planning.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect, separator_of
+from imu_calibration.planning.driver import Driver, DriverSettings
 from imu_calibration.planning.planner import make_planner
 from imu_calibration.planning.repertoire import up_at
 from imu_calibration.planning.situation import expected_noise, require_grade
-from imu_calibration.reference.motion_limits import NOT_CHECKED, MotionLimits, limit_words, limits_of, missing_ranges, range_warnings
-from imu_calibration.reference.trajectory_points import TrajectoryPoints
-from imu_calibration.resources import config_file
-from imu_calibration.settings import setting
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import joint_row
 from msg_adapters.stamps import UnusableMessage
 

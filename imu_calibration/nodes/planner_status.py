@@ -1,8 +1,8 @@
 """Diagnostics of planner_node: state of the drive, parameters outside their tolerance, faults."""
 
-from imu_calibration.driving.driver import Driver, DriveState
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, make_status
 from imu_calibration.nodes.planner_worker import PlannerWorker
+from imu_calibration.planning.driver import Driver, DriveState
 
 _LEVELS = {DriveState.STOPPED: ERROR}
 

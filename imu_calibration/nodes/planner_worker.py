@@ -12,11 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from imu_calibration.diagnosis.live import FOUND, MATES, SIZE
-from imu_calibration.driving.campaign import Campaign, Suspect
-from imu_calibration.driving.driver import Driver, DriveState
-from imu_calibration.errors import ImuCalibrationError, InputError, shortened
+from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND, MATES, SIZE
+from imu_calibration.core.errors import ImuCalibrationError, InputError, shortened
 from imu_calibration.nodes.complaints import ERROR, INFO
+from imu_calibration.planning.campaign import Campaign, Suspect
+from imu_calibration.planning.driver import Driver, DriveState
 
 PERIOD = 0.05
 """Seconds between two checks of the driver."""

@@ -12,14 +12,14 @@ from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
-from imu_calibration import files
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.settings import setting
+from imu_calibration.document import files
+from imu_calibration.kinematics.table import Table
+from imu_calibration.kinematics.urdf import root_of, table_from_urdf
 from imu_calibration.nodes.complaints import WARNING, say
 from imu_calibration.nodes.inputs import latched_qos
 from imu_calibration.nodes.static_frames import StaticFrames
-from imu_calibration.reference.table import Table
-from imu_calibration.reference.urdf import root_of, table_from_urdf
-from imu_calibration.settings import setting
 from msg_adapters.stamps import clean_name
 
 TOPIC = 'topic'

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from imu_calibration import files
-from imu_calibration.by_hand.live import LiveByHand
 from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.live_poses import LiveByHand
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSession, LiveSettings
-from imu_calibration.errors import ImuCalibrationError, shortened
-from imu_calibration.reference.joint import JointNames
-from imu_calibration.reference.table import Table
+from imu_calibration.core.errors import ImuCalibrationError, shortened
+from imu_calibration.document import files
+from imu_calibration.kinematics.joint import JointNames
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.options import CalibrationOptions
 
 DEFAULT = 'calibration.yaml'
 

@@ -19,28 +19,28 @@ from sensor_msgs.msg import Imu, JointState, Temperature
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from imu_calibration import files
-from imu_calibration.calibration.decision import BY_DEFINITION
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_text import calibration_to_text
-from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.settings import setting
+from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.decision import BY_DEFINITION
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
-from imu_calibration.errors import ImuCalibrationError, InputError
+from imu_calibration.estimation.status import DETERMINED
+from imu_calibration.kinematics.motion_limits import limits_of
+from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.inputs import latched_qos, output_qos
 from imu_calibration.nodes.lifecycle import announce, run_node
 from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
-from imu_calibration.reference.motion_limits import limits_of
-from imu_calibration.reference.table import Table
-from imu_calibration.resources import config_file
-from imu_calibration.settings import setting
 from imu_calibration.simulation.live import LiveSimulation
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import CAUSES, GRADES, hidden_causes
 from imu_calibration.simulation.session import SimulationOptions, random_values
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
+from imu_calibration.use_cases.resources import config_file
 from msg_adapters.encode import encode_imu, encode_joints, encode_temperature, rows
 from msg_adapters.joint_trajectory import trajectory_from_message
 

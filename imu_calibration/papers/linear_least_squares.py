@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.core.errors import InputError, NotObservableError
 
 RANK_TOLERANCE = 1e-10
 """A singular value of the unit-column design below this times the largest counts as zero; rounding leaves about 1e-15."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.papers.linear_least_squares import LinearSolution, solve_linear
 
 """m/s^2, the g of the paper's units."""

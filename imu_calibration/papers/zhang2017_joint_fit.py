@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.core.errors import InputError, NotObservableError
+from imu_calibration.kinematics.reference_motion import lever_matrix
 from imu_calibration.papers.linear_least_squares import RANK_TOLERANCE, ToleranceScaled, solve_linear, tolerance_scaled
-from imu_calibration.reference.reference_motion import lever_matrix
 
 DESIGNS = ('Z0', 'Z60', 'O', 'M')
 """Zhang's own runs, the same with the fixture skewed by 60 deg, oscillations, and a mixture with two-axis turns."""

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration import navigation
-from imu_calibration.constants import STANDARD_GRAVITY
+from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.kinematics import strapdown
+from imu_calibration.kinematics.reference_motion import lever_matrix
 from imu_calibration.papers.zhang2017 import StaticModel, fit_static, six_positions, static_model_from_matrix
-from imu_calibration.reference.reference_motion import lever_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ def static_navigation(model: StaticModel, drift_sd_g: float, rng: np.random.Gene
     wander = np.array([_noise_at_end(rng, noise_sd_g * true.scale, seconds, sample_rate) for _ in range(n_draws)])
     for used_matrix, used_bias in ((unscaled, model.bias), (matrix, bias)):
         error = np.linalg.solve(used_matrix, (steady - used_bias)[..., None])[..., 0] - upright
-        constant = np.stack(navigation.constant_error_growth(STANDARD_GRAVITY * error, seconds))
+        constant = np.stack(strapdown.constant_error_growth(STANDARD_GRAVITY * error, seconds))
         scatter = np.linalg.solve(used_matrix[:, None], wander[..., None])[..., 0]
         ends.append(np.linalg.norm(constant + STANDARD_GRAVITY * np.moveaxis(scatter, 1, 0), axis=-1))
     return StaticNavigation(*ends[0], *ends[1])
@@ -72,7 +72,7 @@ def static_navigation(model: StaticModel, drift_sd_g: float, rng: np.random.Gene
 def _noise_at_end(rng, noise_sd, seconds, sample_rate):
     """Return white output noise summed once and twice over the time, shape (2, 3)."""
     time = np.arange(int(round(seconds * sample_rate)) + 1) / sample_rate
-    velocity, position = navigation.error_growth(time, noise_sd * rng.standard_normal((len(time), 3)))
+    velocity, position = strapdown.error_growth(time, noise_sd * rng.standard_normal((len(time), 3)))
     return velocity[-1], position[-1]
 
 
@@ -95,7 +95,7 @@ def spin_growth(cosines: np.ndarray, arms: np.ndarray, axis: tuple[float, float,
     rate = np.tile(np.deg2rad(rate_deg_s) * axis, (len(time), 1))
     error = size_effect_error(cosines, arms, rate, alpha=np.zeros_like(rate))
     mat_ns = Rotation.from_rotvec(rate * time[:, None]).as_matrix()
-    return {'time': time, 'level': navigation.error_growth(time, error, mat_ns), 'body': navigation.error_growth(time, error),
+    return {'time': time, 'level': strapdown.error_growth(time, error, mat_ns), 'body': strapdown.error_growth(time, error),
             'axial_mg': 1e3 * float(error[0] @ axis) / STANDARD_GRAVITY}
 
 
@@ -121,14 +121,14 @@ def tumble(amplitude_deg: tuple[float, float, float], frequency_hz: tuple[float,
     angle = np.multiply.outer(time, angular) + np.asarray(phase)
     size = np.deg2rad(amplitude_deg) * angular
     rate, alpha = size * np.cos(angle), -size * angular * np.sin(angle)
-    return Tumbling(time, navigation.integrate_attitude(time, rate), rate, alpha)
+    return Tumbling(time, strapdown.integrate_attitude(time, rate), rate, alpha)
 
 
 def arm_responses(motion: Tumbling, cosines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return velocity and position histories per metre of each arm component (sensor, component), shape (9, n, 3) each."""
     unit_arms = np.eye(9).reshape(9, 3, 3)
     errors = np.array([size_effect_error(cosines, arms, motion.rate, alpha=motion.alpha) for arms in unit_arms])
-    return navigation.error_growth(motion.time, errors, motion.mat_ns)
+    return strapdown.error_growth(motion.time, errors, motion.mat_ns)
 
 
 def peaks(responses: tuple[np.ndarray, np.ndarray], arms: np.ndarray, every: int = 5) -> np.ndarray:
@@ -138,5 +138,5 @@ def peaks(responses: tuple[np.ndarray, np.ndarray], arms: np.ndarray, every: int
     for response in responses:
         thinned = response[:, ::every]
         histories = (flat @ thinned.reshape(9, -1)).reshape(len(flat), -1, 3)
-        out.append(navigation.largest(histories))
+        out.append(strapdown.largest(histories))
     return np.array(out)

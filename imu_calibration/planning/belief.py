@@ -12,10 +12,10 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import columns
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.coordinates import Coordinates
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import WindowSettings
+from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.simulation.motion_builder import Profile, Segment
 
 SAMPLING = 16.0

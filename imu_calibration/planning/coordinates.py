@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.chances import chi2_isf, norm_ppf
+from imu_calibration.core.distributions import chi2_isf, norm_ppf
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import all_arms, coefficient_jacobian
 from imu_calibration.effects.sensor_model import SensorModel

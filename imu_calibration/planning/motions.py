@@ -7,10 +7,10 @@ from enum import StrEnum
 
 import numpy as np
 
-from imu_calibration.constants import DEG
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.motion_limits import MotionLimits
-from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from imu_calibration.core.constants import DEG
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.motion_limits import MotionLimits
+from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, Segment
 
 STEP = 0.05

@@ -20,19 +20,19 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.options import CalibrationOptions, choose_model
-from imu_calibration.calibration.status import tolerances_of
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel, ReferenceNoise
+from imu_calibration.estimation.status import tolerances_of
+from imu_calibration.kinematics.motion_limits import MotionLimits, limits_of
+from imu_calibration.kinematics.table import Table
+from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
 from imu_calibration.planning.coordinates import Coordinates, ToldApart, WithinTolerances
+from imu_calibration.planning.motion_search import Offers, exchanged, greedy, meets
 from imu_calibration.planning.motions import MotionKind, PlannedMotion, trajectory
 from imu_calibration.planning.repertoire import Repertoire
-from imu_calibration.planning.search import Offers, exchanged, greedy, meets
 from imu_calibration.planning.situation import PROBABILITY, Situation
-from imu_calibration.reference.motion_limits import MotionLimits, limits_of
-from imu_calibration.reference.table import Table
-from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 
 DONE = 'all that was wanted is reached'

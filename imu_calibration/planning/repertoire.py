@@ -7,13 +7,13 @@ from itertools import combinations
 
 import numpy as np
 
-from imu_calibration.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.joint import Joint, JointLimits
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.motion_limits import MotionLimits
+from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.motions import MotionKind, PlannedMotion, motion_at
-from imu_calibration.reference.joint import Joint, JointLimits
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.motion_limits import MotionLimits
-from imu_calibration.reference.table import Table
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 
 N_TRIED = 512

@@ -7,19 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.status import tolerances_of
+from imu_calibration.core.errors import InputError
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import Role
-from imu_calibration.errors import InputError
 from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.status import tolerances_of
+from imu_calibration.kinematics.motion_limits import MotionLimits, limits_of
+from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.belief import exact_information
 from imu_calibration.planning.coordinates import Cause, Coordinates, ToldApart
 from imu_calibration.planning.planner import Planner
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.situation import Situation
-from imu_calibration.reference.motion_limits import MotionLimits, limits_of
-from imu_calibration.reference.table import Table
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile
 
 SESSION = 'quick'

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from imu_calibration.allan.figures import NoiseFigures, bias_processes
-from imu_calibration.chances import chi2_isf
+from imu_calibration.core.distributions import chi2_isf
+from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.errors import InputError
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.window_statistics import BATCH_DOF
 from imu_calibration.planning.belief import (

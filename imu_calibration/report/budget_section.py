@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.core.units import for_people
 from imu_calibration.report.figures import INK, draw, log_axis
 from imu_calibration.report.numbers import text
 from imu_calibration.report.observability_section import short_name
-from imu_calibration.units import for_people
 
 COLOURS = {'noise': '#1f66a8', 'levelling': '#c0561b', 'joint position': '#2b8a57', 'table rate': '#8a5aa8', 'gravity': '#b8860b'}
 LOWEST = 1e-5

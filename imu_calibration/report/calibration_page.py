@@ -3,9 +3,10 @@
 from typing import Any
 
 from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.status import DETERMINED
-from imu_calibration.calibration.trust import usage
+from imu_calibration.core.units import error_text
+from imu_calibration.document.trust import usage
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.status import DETERMINED
 from imu_calibration.report.budget_section import budget_section
 from imu_calibration.report.geometry import derived_section, lever_section
 from imu_calibration.report.navigation_section import navigation_section
@@ -16,7 +17,6 @@ from imu_calibration.report.parameters import parameter_groups
 from imu_calibration.report.proof_section import proof_section
 from imu_calibration.report.readings import reading_tables
 from imu_calibration.report.residuals import draw_windows, residual_section
-from imu_calibration.units import error_text
 
 
 def calibration_report(result: CalibrationResult) -> str:

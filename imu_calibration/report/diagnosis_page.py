@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imu_calibration.diagnosis.result import Diagnosis, Finding, formula_gain
-from imu_calibration.diagnosis.workflow import DiagnosisResult, beyond_lines
+from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, formula_gain
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult, beyond_lines
+from imu_calibration.core.units import for_people
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
 from imu_calibration.report.drawn import Drawn
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, draw
@@ -14,7 +15,6 @@ from imu_calibration.report.overlay import overlay_section, variables
 from imu_calibration.report.page import render
 from imu_calibration.report.parameters import parameter_groups
 from imu_calibration.report.spectrum_figure import draw_tones
-from imu_calibration.units import for_people
 
 BINS = 16
 FEW = 200

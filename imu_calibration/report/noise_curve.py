@@ -6,10 +6,10 @@ from scipy.special import chdtri
 from imu_calibration.allan.identify import NoiseIdentification
 from imu_calibration.allan.processes import FLATNESS, FLICKER, RANDOM_WALK, WHITE
 from imu_calibration.allan.terms import predicted
+from imu_calibration.core.units import NOISE, for_people
 from imu_calibration.effects.base import SENSORS, UNIT
 from imu_calibration.report.drawn import Drawn
 from imu_calibration.report.figures import AXIS, FAINT, GREY, MARKER, draw, log_axis
-from imu_calibration.units import NOISE, for_people
 
 
 def draw_curve(result: NoiseIdentification, sensor: str) -> Drawn:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.units import for_people, significant, with_sd
+from imu_calibration.core.units import for_people, significant, with_sd
 
 
 def text(value: float | None, digits: int = 3) -> str:

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SHORT
 from imu_calibration.report.figures import AFTER, GREY, INK, STATUS, draw, log_axis
 from imu_calibration.report.numbers import text

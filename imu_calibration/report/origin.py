@@ -3,11 +3,11 @@
 from functools import singledispatch
 from typing import Any
 
-from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.core.settings import describe
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.numbers import fixed, in_unit, text
-from imu_calibration.settings import describe
 
 
 def recording_facts(result: CalibrationResult) -> list[tuple[str, str]]:

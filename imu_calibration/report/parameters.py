@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult
 from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.status import COMMON_SCALE, DETERMINED, FIXED, HELD, LIKELIHOOD_RATIO, REPLACEMENT
-from imu_calibration.diagnosis.workflow import DiagnosisResult
+from imu_calibration.estimation.status import COMMON_SCALE, DETERMINED, FIXED, HELD, LIKELIHOOD_RATIO, REPLACEMENT
 from imu_calibration.report.numbers import in_unit, pair, people, text
 
 SENSOR_TITLES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope', 'reference': 'Table and clock'}

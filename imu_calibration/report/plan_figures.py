@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from imu_calibration.by_hand.hand_plan import HandPlan
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.planning.hand_plan import HandPlan
 from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.planner import Plan
 from imu_calibration.report.drawn import Drawn

@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.by_hand.hand_plan import HandPlan
+from imu_calibration.core.units import for_people
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.planning.hand_plan import HandPlan
 from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.planner import Plan
 from imu_calibration.report.hand_plan_figure import draw_steps
 from imu_calibration.report.numbers import text
 from imu_calibration.report.page import render
 from imu_calibration.report.plan_figures import draw_motion, draw_progress, draw_steps_progress
-from imu_calibration.units import for_people
 
 SAYS = {MotionKind.POSE: 'rest', MotionKind.RETURN: 'return', MotionKind.SPIN: 'spin', MotionKind.SWING: 'swing',
         MotionKind.TOGETHER: 'joint turn', MotionKind.MOVE: 'move'}

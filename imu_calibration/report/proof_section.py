@@ -1,8 +1,8 @@
 """The proof in numbers: errors on held-out data, by sensor and regime."""
 
-from imu_calibration.calibration.decision import harmed, ratio_text
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.units import error_text
+from imu_calibration.core.units import error_text
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.decision import harmed, ratio_text
 
 
 def proof_section(calibration: Calibration) -> list[dict[str, str | bool]]:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from imu_calibration.beyond.spectrum import CLEAR
-from imu_calibration.beyond.unexplained import Unexplained
 from imu_calibration.report.figures import AFTER, GREY, INK, draw
+from imu_calibration.selection.spectrum import CLEAR
+from imu_calibration.selection.unexplained import Unexplained
 
 
 def draw_tones(sensor: str, rest: Unexplained) -> str:

@@ -1,6 +1,6 @@
 """
-Selection of the effects that a recording supports, proven on held-out windows.
+Selection of the effects that a recording supports, proven on held-out windows, and analysis of the residual.
 
-In: windows, a table and a sensor model. Out: an `Investigation`: the effects named, with their evidence, and the extended model.
-Read `investigation` first; a diagnosis is its description.
+In: windows, a table and a sensor model. Out: an `Investigation`: the effects named, with their evidence, the extended model, and for the
+unexplained excess its regimes and a proposed formula. Read `investigation` first, then `unexplained`.
 """

@@ -11,8 +11,8 @@ import numpy as np
 from imu_calibration.effects.base import Effect
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.evidence import WindowEvidence, agree, folds_of
 from imu_calibration.selection.noise_beside_effects import first_noise, noise_beside_effects
 from imu_calibration.selection.normal_matrices import normal_matrix

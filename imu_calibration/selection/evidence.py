@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from imu_calibration.chances import chi2_sf, f_sf
+from imu_calibration.core.distributions import chi2_sf, f_sf
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, solve_normal, solve_scaled

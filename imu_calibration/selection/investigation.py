@@ -6,11 +6,11 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.lags import CLOCK, FAMILY
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import NotObservableError
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import LEAST_WINDOWS
 from imu_calibration.selection.explained_share import Explained, pruned, sensors_of

@@ -7,8 +7,8 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import predict
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window, all_samples
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window, all_samples
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import LEAST_WINDOWS
 from imu_calibration.selection.explained_share import LEAST_SHARE, SIGNIFICANT_REST, Explained

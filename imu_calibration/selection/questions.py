@@ -8,10 +8,10 @@ import numpy as np
 from imu_calibration.effects.base import SECTIONS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_at_rest import VIBRATES
-from imu_calibration.reference.signal_history import HALF_WIDTH
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.quiet_detector import least_variance
-from imu_calibration.segmentation.window import Window
+from imu_calibration.kinematics.signal_history import HALF_WIDTH
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.quiet_detector import least_variance
+from imu_calibration.preprocessing.window import Window
 
 TURN = 4 * HALF_WIDTH
 """Sufficient reversal of the temperature, K."""

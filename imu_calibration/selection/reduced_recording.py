@@ -14,8 +14,8 @@ from imu_calibration.estimation.accumulator import Accumulator, restricted_windo
 from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.triangular import PackedFactor, unpacked
 from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_windows
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window, chunks
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window, chunks
 from imu_calibration.selection.recent import Recent
 from imu_calibration.selection.time_constant_bank import BankEntry
 

@@ -5,16 +5,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.chances import norm_sf
+from imu_calibration.core.distributions import norm_sf
+from imu_calibration.core.samples import rounding_variance
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.estimation.window_statistics import joined_motion
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import rounding_variance
-from imu_calibration.segmentation.window import Window
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.evidence import LEAST_WINDOWS, locked_windows
 
 MARGIN = 4.0

@@ -6,10 +6,10 @@ from math import perm
 
 import numpy as np
 
-from imu_calibration.errors import InputError
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.motion_limits import MotionLimits
-from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.motion_limits import MotionLimits
+from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
 
 PEAK_ACCELERATION_OF_BRAKING = 1.5
 """Largest acceleration while a joint brakes, in units of its rate over the duration."""

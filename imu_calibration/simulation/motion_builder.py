@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from imu_calibration.errors import InputError
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.motion_limits import MotionLimits, free_limits
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.motion_limits import MotionLimits, free_limits
 
 # Smooth steps from 0 to 1 and their derivatives, lowest power first. A position blended by the septic and a rate blended
 # by the quintic both have continuous position, rate, acceleration and jerk where segments meet.

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.errors import InputError, did_you_mean
-from imu_calibration.reference.motion_limits import free_limits, limits_of
-from imu_calibration.reference.table import Table
+from imu_calibration.core.errors import InputError, did_you_mean
+from imu_calibration.kinematics.motion_limits import free_limits, limits_of
+from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation import motion_primitives
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, stretch
 from imu_calibration.simulation.motion_primitives import (

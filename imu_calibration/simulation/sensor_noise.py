@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imu_calibration.constants import DEG, DEG_H, MICRO_G, STANDARD_GRAVITY
-from imu_calibration.errors import InputError
+from imu_calibration.core.constants import DEG, DEG_H, MICRO_G, STANDARD_GRAVITY
+from imu_calibration.core.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -6,16 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import clip, predict
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import InputError
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.signal_history import HALF_WIDTH
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
-from imu_calibration.segmentation.window import Window, WindowKind, all_samples, chunks
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.signal_history import HALF_WIDTH
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window, WindowKind, all_samples, chunks
+from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import Profile
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_imu_noise, gauss_markov, jitter_stamps, read_encoders
 
@@ -172,7 +172,7 @@ def temperature_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray |
 
 
 def branch_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray | None:
-    """Return the thermal branch of the warm-up (`reference.signal_history`), or None without a temperature topic: it never turns."""
+    """Return the thermal branch of the warm-up (`kinematics.signal_history`), or None without a temperature topic: it never turns."""
     warmth = temperature_at(time, options)
     return None if warmth is None else np.clip((warmth - options.temperature_start_c) / HALF_WIDTH, -1.0, 1.0)
 

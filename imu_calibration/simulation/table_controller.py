@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.errors import InputError
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.motion_limits import MotionLimits, free_limits
-from imu_calibration.reference.trajectory_points import TrajectoryPoints
-from imu_calibration.settings import setting
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.settings import setting
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.motion_limits import MotionLimits, free_limits
+from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
 from imu_calibration.simulation.joint_trajectory import JointTrajectory, braking_from, excess, trajectory_from
 from imu_calibration.simulation.motion_builder import Profile
 

@@ -8,18 +8,18 @@ from os import PathLike
 from pathlib import Path
 from typing import Unpack
 
-from imu_calibration import files
-from imu_calibration.by_hand.workflow import calibrate_without_table
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
-from imu_calibration.calibration.check import check_on_table
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_text import calibration_to_text
+from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.result import CalibrationResult, exit_code, summary
-from imu_calibration.calibration.statements import Verdict
-from imu_calibration.calibration.verdict import judged
-from imu_calibration.errors import InputError
-from imu_calibration.progress import counter, report
-from imu_calibration.samples import SampleBlock
+from imu_calibration.calibration.table_check import check_on_table
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.progress import counter, report
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.statements import Verdict
+from imu_calibration.document.verdict import judged
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
 from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.pool import jobs_for, process_mapper

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Unpack
 
-from imu_calibration import files
-from imu_calibration.by_hand.check import check_by_hand, gravity_of
-from imu_calibration.calibration.check import CheckResult, check_on_table
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.samples import SampleBlock
+from imu_calibration.calibration.hand_check import check_by_hand, gravity_of
+from imu_calibration.calibration.table_check import CheckResult, check_on_table
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
 from imu_calibration.use_cases.provenance import made_from
 from imu_calibration.use_cases.recordings import name_of, open_bag, provenance_of, source_of

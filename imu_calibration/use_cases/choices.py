@@ -4,18 +4,18 @@ from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any, TypedDict
 
-from imu_calibration import files
 from imu_calibration.allan.figures import NoiseFigures
-from imu_calibration.calibration.document_text import checked_tolerances
-from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import NominalScaling
+from imu_calibration.core.settings import override
+from imu_calibration.document import files
+from imu_calibration.document.calibration_text import checked_tolerances
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.errors import InputError
-from imu_calibration.reference.earth import local_gravity
-from imu_calibration.resources import config_file
-from imu_calibration.samples import NominalScaling
-from imu_calibration.segmentation.window import WindowSettings
-from imu_calibration.settings import override
+from imu_calibration.kinematics.earth import local_gravity
+from imu_calibration.preprocessing.window import WindowSettings
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.recordings import Topics
+from imu_calibration.use_cases.resources import config_file
 
 
 class Choices(TypedDict, total=False):

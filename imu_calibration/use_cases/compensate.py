@@ -5,14 +5,14 @@ from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 
-from imu_calibration import files
 from imu_calibration.allan.figures import NoiseFigures
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.trust import caveats, usable, with_measured_noise
 from imu_calibration.compensation.stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
-from imu_calibration.errors import InputError
-from imu_calibration.progress import counter
-from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.progress import counter
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.trust import caveats, usable, with_measured_noise
 from imu_calibration.use_cases.choices import noise_of
 from imu_calibration.use_cases.recordings import Topics, open_bag, temperatures
 

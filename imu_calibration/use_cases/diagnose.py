@@ -6,13 +6,13 @@ from functools import cached_property
 from os import PathLike
 from typing import Unpack
 
-from imu_calibration import files
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_text import calibration_to_text
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult, diagnose_recording, diagnose_without_table
 from imu_calibration.calibration.result import exit_code
-from imu_calibration.diagnosis.workflow import DiagnosisResult, diagnose_recording, diagnose_without_table
-from imu_calibration.progress import counter, report
-from imu_calibration.samples import SampleBlock
+from imu_calibration.core.progress import counter, report
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
 from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.provenance import provenance_with

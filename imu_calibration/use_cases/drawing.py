@@ -5,7 +5,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from imu_calibration import files
+from imu_calibration.document import files
 from imu_calibration.report.drawn import Drawn
 
 

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from imu_calibration import files
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.compensation.evaluation import session_truth
-from imu_calibration.exports.export import Export, export, find_reader, find_target
-from imu_calibration.exports.imported import import_file
-from imu_calibration.exports.loss import TrialMotion, motion_of, recorded_motion, temperature_at
-from imu_calibration.samples import ImuSamples
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.exports.export import Export, export, find_reader, find_target
+from imu_calibration.document.exports.imported import import_file
+from imu_calibration.document.exports.loss import TrialMotion, motion_of, recorded_motion, temperature_at
 from imu_calibration.use_cases.recordings import Topics, name_of, source_of, temperatures
 from imu_calibration.use_cases.stand import Stand, table_of
 
@@ -27,7 +27,7 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
     ----------
     calibration : Calibration or path-like
     to : str
-        Name of the target, as `exports.export.all_targets` lists them.
+        Name of the target, as `document.exports.export.all_targets` lists them.
     output : path-like, optional
         The file; None: no file is written.
     noise : path-like, optional
@@ -35,7 +35,7 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
     rate : float, optional
         Rate at which the target gets the readings, Hz; default that of the noise document.
     bag : path-like, optional
-        Recording on which the loss is measured; default `exports.loss.standard_motion`.
+        Recording on which the loss is measured; default `document.exports.loss.standard_motion`.
     stand : path-like, Table or Arm, optional
         Reference of the true motion of the recording; default its compensated readings.
     topics : Topics

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from imu_calibration.calibration.coverage import ARMS_TIMES, ARROW, RADIUS, SEEN, TINY, WHITE, Coverage, cells_of, line_of
+from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.errors import InputError
 
 if TYPE_CHECKING:
-    from imu_calibration.calibration.document import Calibration
     from imu_calibration.calibration.result import CalibrationResult
-    from imu_calibration.segmentation.window import Window
+    from imu_calibration.document.calibration import Calibration
+    from imu_calibration.preprocessing.window import Window
 
 
 PARAMETERS, RESIDUAL, SPECTRUM, SPHERE = '/imu/parameters', '/imu/residual/windows', '/imu/residual/spectrum', '/imu/coverage'

@@ -4,21 +4,21 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from os import PathLike
 
-from imu_calibration.by_hand.by_evidence import EvidentHand
-from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
-from imu_calibration.by_hand.options import hand_options
-from imu_calibration.by_hand.result import HandResult
-from imu_calibration.by_hand.workflow import hand_result, read_by_hand
-from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.gathered import Gathered
-from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.hand_by_evidence import EvidentHand
+from imu_calibration.calibration.hand_result import HandResult
+from imu_calibration.calibration.hand_workflow import hand_result, read_by_hand
+from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.calibration.table_result import TableResult
-from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.preflight.checks import Preflight, unusable, warnings
-from imu_calibration.preflight.evidence import REFUSE, CheckFinding
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.stream_cleaning import StreamStatistics
+from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.checks import Preflight, unusable, warnings
+from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
+from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
+from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
+from imu_calibration.references.gravity.hand_options import hand_options
+from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.gathered import Gathered
 from imu_calibration.use_cases.recordings import Source, Topics, open_bag, source_of
 from msg_adapters.bag import Recording, imu_topics, list_topics
 

@@ -8,10 +8,10 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 from numpy.typing import ArrayLike
 
-from imu_calibration import files
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.errors import ImuCalibrationError, InputError
-from imu_calibration.samples import SampleBlock
+from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.use_cases.calibrate import Calibrated
 from imu_calibration.use_cases.calibrate import calibrate as _calibrate
 from imu_calibration.use_cases.check import check as _check

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.diagnosis.traces import Traces
+from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.report.overlay import WHEN, histogram
 from imu_calibration.use_cases.foxglove_file import foxglove

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import Any
 
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 
 
 def jobs_for(asked: int | None, n_items: int) -> int:

@@ -6,14 +6,14 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from imu_calibration import files
-from imu_calibration.documents import to_text
-from imu_calibration.errors import ImuCalibrationError, InputError
-from imu_calibration.reference.table import Table
-from imu_calibration.resources import config_file
-from imu_calibration.samples import SampleBlock
+from imu_calibration.core.documents import to_text
+from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document import files
+from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.choices import Choices
 from imu_calibration.use_cases.recordings import provenance_of
+from imu_calibration.use_cases.resources import config_file
 from imu_calibration.use_cases.stand import Arm, Stand
 
 LABELS = ('serial', 'operator')

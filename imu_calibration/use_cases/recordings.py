@@ -8,10 +8,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from imu_calibration import files
-from imu_calibration.errors import InputError
-from imu_calibration.progress import counter
-from imu_calibration.samples import SampleBlock, TemperatureSamples
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.progress import counter
+from imu_calibration.core.samples import SampleBlock, TemperatureSamples
+from imu_calibration.document import files
 from msg_adapters.bag import Recording, open_recording
 from msg_adapters.storage import read_ahead
 

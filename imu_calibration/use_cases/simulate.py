@@ -9,18 +9,18 @@ from typing import Unpack, cast
 
 import numpy as np
 
-from imu_calibration import documents, files
-from imu_calibration.calibration.decision import BY_DEFINITION
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_text import calibration_to_text
-from imu_calibration.calibration.status import DETERMINED
+from imu_calibration.core import documents
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.decision import BY_DEFINITION
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
-from imu_calibration.errors import InputError
-from imu_calibration.reference.table import Table
-from imu_calibration.resources import config_file
-from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.estimation.status import DETERMINED
+from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import BIAS_TIME, ReplayNoise, SimulationOptions, hidden_effect, random_values
@@ -28,6 +28,7 @@ from imu_calibration.simulation.session import replay as run_replay
 from imu_calibration.simulation.session import simulate as run_session
 from imu_calibration.use_cases.choices import Choices, catalogue_of, check_names, topics_of
 from imu_calibration.use_cases.recordings import name_of, source_of
+from imu_calibration.use_cases.resources import config_file
 from imu_calibration.use_cases.stand import LIKELY_LINK, Arm, Stand, table_of
 
 

@@ -5,19 +5,19 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Unpack
 
-from imu_calibration import files
-from imu_calibration.by_hand.next_pose import hand_coverage
-from imu_calibration.by_hand.options import HandOptions
-from imu_calibration.by_hand.result import HandResult
-from imu_calibration.by_hand.status import NOTHING
 from imu_calibration.calibration.coverage import Coverage, bars_of, table_coverage
-from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.effect_states import group_states
+from imu_calibration.calibration.hand_result import HandResult
+from imu_calibration.calibration.next_pose import hand_coverage
+from imu_calibration.calibration.pose_scan import NOTHING
 from imu_calibration.calibration.result import CalibrationResult, exit_code
-from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.calibration.table_result import TableResult
-from imu_calibration.errors import InputError
-from imu_calibration.samples import SampleBlock
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.estimation.status import tolerances_of
+from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.choices import Choices
 from imu_calibration.use_cases.foxglove_file import PARAMETERS, RESIDUAL, SPECTRUM, foxglove_bytes, parameters, residual, spectrum

@@ -9,7 +9,6 @@ import yaml
 from refusal import refused
 from scipy.signal import lfilter
 
-from imu_calibration import files
 from imu_calibration.allan.document import noise_from_text, noise_to_text
 from imu_calibration.allan.identify import figures_of, identify_noise, read_rest
 from imu_calibration.allan.processes import RANDOM_WALK
@@ -17,10 +16,11 @@ from imu_calibration.allan.summary import exit_code, filter_lines, lines
 from imu_calibration.allan.terms import HELD, Term, identify_axis
 from imu_calibration.allan.trends import AxisTrend, Blocks, TrendSearch
 from imu_calibration.cli.main import main
-from imu_calibration.errors import DocumentError, InputError
-from imu_calibration.exports.export import export, find_target
+from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
+from imu_calibration.document import files
+from imu_calibration.document.exports.export import export, find_target
 from imu_calibration.report.noise_page import noise_report
-from imu_calibration.samples import ImuSamples, SampleBlock, TemperatureSamples
 from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration

@@ -10,28 +10,28 @@ from refusal import refused
 from test_adapters_copy import raw_messages
 from test_live_calibration import blocks
 
-from imu_calibration import files
 from imu_calibration.allan.document import noise_to_text
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures, bias_processes
 from imu_calibration.allan.processes import FLICKER, RANDOM_WALK, allan_variance, gauss_markov
 from imu_calibration.allan.summary import position_budget
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, Term
-from imu_calibration.by_hand.live import LiveByHand
+from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
-from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.trust import with_measured_noise
+from imu_calibration.calibration.live_poses import LiveByHand
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import CompensationStream
-from imu_calibration.diagnosis.live import question_about
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.document import files
+from imu_calibration.document.trust import with_measured_noise
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.errors import InputError
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.noise_search import estimate_offsets
+from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.adoption import adopt
 from imu_calibration.nodes.compensator_settings import CompensatorSettings
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples
+from imu_calibration.references.options import CalibrationOptions
 from msg_adapters.imu import FIELDS, parse_imu
 
 from worlds import physics

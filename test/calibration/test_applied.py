@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.by_hand.calibrate import gather_by_hand
-from imu_calibration.by_hand.check import prove_readings
-from imu_calibration.by_hand.workflow import read_by_hand
-from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
+from imu_calibration.calibration.hand_check import prove_readings
+from imu_calibration.calibration.hand_workflow import read_by_hand
 from imu_calibration.calibration.proof import nominal_values
-from imu_calibration.calibration.trust import caveats
-from imu_calibration.calibration.uncorrected import END, MEAN
-from imu_calibration.constants import DEG
+from imu_calibration.core.constants import DEG
+from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
+from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
+from imu_calibration.document.trust import caveats
+from imu_calibration.document.uncorrected import END, MEAN
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.term import term
-from imu_calibration.samples import ImuSamples, SampleBlock, TemperatureSamples
+from imu_calibration.references.gravity.hand_calibration import gather_by_hand
 from imu_calibration.use_cases.recordings import Topics, source_of
 from msg_adapters.write import write_session
 
@@ -118,7 +118,7 @@ def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third
 def model_output(calibration, time):
     """Return the output of the gyroscope of a calibration at rest at a time, rad/s, shape (3,)."""
     from imu_calibration.effects.forward_equations import sensor_output
-    from imu_calibration.reference.reference_motion import Reference
+    from imu_calibration.kinematics.reference_motion import Reference
     nothing = np.zeros((1, 3))
     ref = Reference(np.array([time]), np.eye(3)[None], nothing, nothing, nothing, 0.0)
     return sensor_output(calibration.model, 'gyroscope', calibration.values, ref=ref)[0]
@@ -156,7 +156,7 @@ def test_a_drift_by_hand_is_applied_as_its_value_at_the_end():
 
 
 def test_corrected_readings_travel_with_their_sample():
-    from imu_calibration.segmentation.window_finder import MotionGatherer
+    from imu_calibration.preprocessing.window_finder import MotionGatherer
     session = imu.simulate('quick', seed=2, stamp_jitter_us=3000.0)
     block = session.samples
     marked = replace(block, imu=replace(block.imu, corrected=np.hstack([2 * block.imu.force_s, 3 * block.imu.rate_s])))

@@ -8,23 +8,24 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.beyond.inquiry import Examination
-from imu_calibration.beyond.unexplained import Unexplained, biases_off
-from imu_calibration.calibration import by_evidence, gathered
+from imu_calibration.calibration import by_evidence
 from imu_calibration.calibration.by_evidence import _moves, stands_out
-from imu_calibration.calibration.gathered import SpreadWindows
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.calibration.model_changes import Demand
-from imu_calibration.diagnosis.diagnose import told
-from imu_calibration.diagnosis.workflow import diagnose_recording
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable import gathered
+from imu_calibration.references.turntable.extended_model import extended_solution
+from imu_calibration.references.turntable.gathered import SpreadWindows
 from imu_calibration.report.diagnosis_page import diagnosis_report
 from imu_calibration.selection import investigation, questions
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.extended_model import extended_solution
 from imu_calibration.selection.investigation import investigate
+from imu_calibration.selection.residual_analysis import Examination
 from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
+from imu_calibration.selection.unexplained import Unexplained, biases_off
 
 from worlds.misfit_coverage import calibrated
 from worlds.misfit_worlds import make_pair

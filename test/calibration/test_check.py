@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.check import CheckResult, check_on_table
-from imu_calibration.calibration.document_text import calibration_to_text
+from imu_calibration.calibration.table_check import CheckResult, check_on_table
 from imu_calibration.cli.main import main
-from imu_calibration.documents import to_text
-from imu_calibration.errors import InputError
+from imu_calibration.core.documents import to_text
+from imu_calibration.core.errors import InputError
+from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.estimation.pieces import Regime
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.check import check
 

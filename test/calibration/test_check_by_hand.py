@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.cli.main import main
-from imu_calibration.samples import SampleBlock, TemperatureSamples
+from imu_calibration.core.samples import SampleBlock, TemperatureSamples
+from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.check import check
 from msg_adapters.write import write_session

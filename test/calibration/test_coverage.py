@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imu_calibration.by_hand.advice import WEIGHTS, _rollout, foretold
-from imu_calibration.by_hand.hand_step import HandStep, direction_words, shortest_turn
-from imu_calibration.by_hand.live import LiveByHand
-from imu_calibration.by_hand.next_pose import hand_coverage, knowledge_of
-from imu_calibration.by_hand.options import HandOptions
-from imu_calibration.by_hand.status import NOTHING
+from imu_calibration.calibration.advice import WEIGHTS, _rollout, foretold
 from imu_calibration.calibration.coverage import DIRECTIONS, ENOUGH, Bar, Coverage, Step, line_of, table_coverage
-from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.hand_step import HandStep, direction_words, shortest_turn
+from imu_calibration.calibration.live_poses import LiveByHand
+from imu_calibration.calibration.next_pose import hand_coverage, knowledge_of
+from imu_calibration.calibration.pose_scan import NOTHING
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
-from imu_calibration.errors import NotObservableError
+from imu_calibration.core.errors import NotObservableError
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.estimation.standard_motions import MOTIONS, motions_about
-from imu_calibration.samples import SampleBlock
+from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.calibrate import calibrate
 
 from worlds.hand_sessions import GRAVITY

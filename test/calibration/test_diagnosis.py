@@ -9,9 +9,9 @@ import pytest
 from refusal import refused
 from scipy.stats import chi2
 
-from imu_calibration.diagnosis.diagnose import diagnose
-from imu_calibration.diagnosis.result import to_mapping
-from imu_calibration.errors import NotObservableError
+from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
+from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
+from imu_calibration.core.errors import NotObservableError
 from imu_calibration.selection.evidence import locked_windows
 from imu_calibration.selection.gain import heldout_gain
 from imu_calibration.selection.investigation import investigate

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
-from imu_calibration.by_hand.inquiry import Inquiry, investigate_by_hand
-from imu_calibration.by_hand.options import HandOptions
-from imu_calibration.diagnosis import hand_diagnosis
-from imu_calibration.diagnosis.hand_diagnosis import diagnose_by_hand
-from imu_calibration.diagnosis.result import to_mapping
-from imu_calibration.diagnosis.workflow import diagnosis_lines
+from imu_calibration.calibration.diagnosis import hand_diagnosis
+from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
+from imu_calibration.calibration.diagnosis.hand_diagnosis import diagnose_by_hand
+from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import NotObservableError
-from imu_calibration.reference.earth import EARTH_RATE
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.earth import EARTH_RATE
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
+from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.model_selection import Inquiry, investigate_by_hand
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import random_values
 from imu_calibration.simulation.session import simulate as simulate_session
@@ -182,9 +182,9 @@ def test_too_few_poses_are_refused_with_their_number():
 @pytest.mark.real_data
 def test_xsens_counts_tells_no_stories(recordings):
     """The accelerometer scatters beyond its noise and no effect claims it; the gyroscope's answer to gravity is found and predicts."""
-    from imu_calibration.calibration.options import CalibrationOptions
-    from imu_calibration.diagnosis.workflow import diagnose_without_table
-    from imu_calibration.samples import NominalScaling
+    from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_without_table
+    from imu_calibration.core.samples import NominalScaling
+    from imu_calibration.references.options import CalibrationOptions
     from msg_adapters.bag import open_recording
     options = CalibrationOptions(nominal=NominalScaling(32768, 415, 32768, 4770))
     with open_recording(recordings / 'xsens_counts', want_joints=False) as recording:

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.calibrate import calibrate
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.result import ReferenceErrors
+from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.calibration.table_result import _Faster, _Heavier, _Tilted, _Turned, error_budget, parameter_shifts
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solver import solve
-from imu_calibration.reference.perturbed_table import tilt
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import SampleBlock
+from imu_calibration.kinematics.perturbed_table import tilt
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate

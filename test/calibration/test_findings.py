@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from imu_calibration.diagnosis import diagnose as on_a_table
-from imu_calibration.diagnosis import hand_diagnosis as by_hand
-from imu_calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST, candidates_of, finding, sentence
-from imu_calibration.diagnosis.separating_motion import motions_of_one_joint
+from imu_calibration.calibration.diagnosis import hand_diagnosis as by_hand
+from imu_calibration.calibration.diagnosis import table_diagnosis as on_a_table
+from imu_calibration.calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST, candidates_of, finding, sentence
+from imu_calibration.calibration.diagnosis.separating_motion import motions_of_one_joint
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
@@ -90,8 +90,8 @@ def test_both_diagnoses_put_findings_together_in_one_place():
 
 def test_what_explains_much_but_leaves_most_is_said():
     """An effect that explains thousands of nats is not passed over in silence because it may not be named."""
-    from imu_calibration.diagnosis.result import Candidate
-    from imu_calibration.diagnosis.workflow import nothing_named
+    from imu_calibration.calibration.diagnosis.diagnosis_result import Candidate
+    from imu_calibration.calibration.diagnosis.diagnosis_workflow import nothing_named
 
     class Told:
         candidates = (Candidate('time_offset', 'reference', 4321.0, 0.0, 4321.0, 0.0, LEAVES_MOST),)

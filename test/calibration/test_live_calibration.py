@@ -7,16 +7,16 @@ import pytest
 from refusal import refused
 
 from imu_calibration.calibration import accumulator_state
-from imu_calibration.calibration.calibrate import calibrate, conclude, solve_gathered
-from imu_calibration.calibration.decision import HELPS
 from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.session import LiveSettings, SolvePacer
+from imu_calibration.calibration.table_calibration import calibrate, conclude, solve_gathered
+from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
+from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.document.decision import HELPS
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import DocumentError, InputError, NotObservableError
-from imu_calibration.preflight.stream_watch import StreamWatch
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.stream_watch import StreamWatch
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 

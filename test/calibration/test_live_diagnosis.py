@@ -8,16 +8,16 @@ import pytest
 from test_live_calibration import assert_same, blocks
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.diagnosis.live_diagnosis import Answer, DiagnosisState, describe, question_about
+from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.model_changes import Demand
-from imu_calibration.calibration.options import CalibrationOptions
 from imu_calibration.calibration.session import LiveSettings
-from imu_calibration.diagnosis.diagnose import told
-from imu_calibration.diagnosis.live import Answer, DiagnosisState, describe, question_about
-from imu_calibration.diagnosis.workflow import diagnose_recording
-from imu_calibration.errors import DocumentError
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import SampleBlock
+from imu_calibration.core.errors import DocumentError
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.options import CalibrationOptions
 
 from worlds import physics
 from worlds.misfit_worlds import make_pair

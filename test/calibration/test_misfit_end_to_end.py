@@ -2,9 +2,9 @@
 
 import pytest
 
-from imu_calibration.calibration.decision import HELPS
-from imu_calibration.errors import ImuCalibrationError
-from imu_calibration.reference.table import Table
+from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.document.decision import HELPS
+from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.check import check
 

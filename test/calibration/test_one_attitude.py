@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.decision import UNPROVEN, decide, reason_of
-from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
-from imu_calibration.calibration.status import HELD
+from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
+from imu_calibration.document.decision import UNPROVEN, decide, reason_of
 from imu_calibration.effects.base import Role
-from imu_calibration.reference.table import Table
+from imu_calibration.estimation.status import HELD
+from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.check import check
 

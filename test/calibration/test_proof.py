@@ -6,15 +6,15 @@ import re
 import numpy as np
 import pytest
 
-from imu_calibration.calibration import held_out
-from imu_calibration.calibration.decision import HELPS, reason_of, worse_regimes
+from imu_calibration.document.decision import HELPS, reason_of, worse_regimes
 from imu_calibration.effects.applied import applied_values
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.pieces import Regime, moving_pieces
 from imu_calibration.estimation.solver import solve
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable import held_out
 from imu_calibration.use_cases.calibrate import calibrate
 
 from worlds.misfit_worlds import make_pair

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.by_hand.calibrate import gather_by_hand, solve_by_hand
-from imu_calibration.by_hand.options import HandOptions
-from imu_calibration.by_hand.proof import FOLDS, _Rows, prove_by_hand
-from imu_calibration.calibration.decision import HELPS, decide
-from imu_calibration.samples import SampleBlock
+from imu_calibration.calibration.hand_proof import FOLDS, _Rows, prove_by_hand
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document.decision import HELPS, decide
+from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
+from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.use_cases.calibrate import calibrate
 
 from worlds.hand_sessions import GRAVITY, NOMINAL, simulate

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import SampleBlock
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.kinematics.table import Table
 
 from worlds.physics import make_session
 from worlds.physics_hand import hold_and_turn

@@ -8,14 +8,14 @@ import yaml
 
 from imu_calibration.calibration import collector as gathering
 from imu_calibration.calibration.collector import GatherStep
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import accumulator as least_squares
 from imu_calibration.estimation.solver import solve
-from imu_calibration.reference.table import Table
-from imu_calibration.resources import config_file
-from imu_calibration.samples import SampleBlock
+from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.use_cases.resources import config_file
 
 TABLE = Table.from_mapping(yaml.safe_load(config_file('table_simulated.yaml').read_text(encoding='utf-8')))
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names))

@@ -2,8 +2,8 @@
 
 import pytest
 
-from imu_calibration.calibration.statements import WARNING
-from imu_calibration.reference.table import Table
+from imu_calibration.document.statements import WARNING
+from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 
 from worlds.physics import make_session

@@ -7,7 +7,7 @@ import pytest
 
 from imu_calibration.cli import parser
 from imu_calibration.cli.main import main
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 
 
 def add_arguments(arguments):

@@ -8,10 +8,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from imu_calibration.cli.main import main
-from imu_calibration.errors import InputError
-from imu_calibration.files import read_calibration, read_robot_description
-from imu_calibration.reference.static_transforms import up_of
-from imu_calibration.samples import ImuSamples, JointSamples
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, JointSamples
+from imu_calibration.document.files import read_calibration, read_robot_description
+from imu_calibration.kinematics.static_transforms import up_of
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.use_cases.recordings import Topics
 from imu_calibration.use_cases.simulate import simulate
@@ -172,6 +172,6 @@ def test_a_profile_that_leaves_the_limits_is_refused(session):
 
 
 def test_samples_in_memory_name_their_link(home):
-    from imu_calibration.samples import SampleBlock
+    from imu_calibration.core.samples import SampleBlock
     imu = ImuSamples(np.zeros(1, np.int64), np.zeros((1, 3)), np.zeros((1, 3)), 'frame')
     assert table_of(home / 'arm.urdf', [SampleBlock(imu)]).joint_names.read == ('tilt',)

@@ -9,7 +9,7 @@ import yaml
 
 from imu_calibration.cli.main import main
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate

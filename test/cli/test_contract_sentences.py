@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 
-from imu_calibration.calibration import trust
-from imu_calibration.calibration.check import CheckResult
-from imu_calibration.calibration.decision import NO_PROOF, reason_of
-from imu_calibration.calibration.document_text import calibration_from_text
-from imu_calibration.errors import InputError, with_hint
-from imu_calibration.exports.export import find_target, loss_lines
-from imu_calibration.exports.loss import Loss
+from imu_calibration.calibration.table_check import CheckResult
+from imu_calibration.core.errors import InputError, with_hint
+from imu_calibration.document import trust
+from imu_calibration.document.calibration_text import calibration_from_text
+from imu_calibration.document.decision import NO_PROOF, reason_of
+from imu_calibration.document.exports.export import find_target, loss_lines
+from imu_calibration.document.exports.loss import Loss
 from imu_calibration.use_cases.check import Checked
 
 from worlds.compensation_cases import random_calibration

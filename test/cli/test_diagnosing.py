@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from imu_calibration.calibration.document_text import calibration_from_text
 from imu_calibration.cli.main import main
+from imu_calibration.document.calibration_text import calibration_from_text
 
 pytestmark = pytest.mark.slow
 

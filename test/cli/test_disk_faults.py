@@ -8,14 +8,14 @@ import sys
 import pytest
 from refusal import refused
 
-from imu_calibration import files
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
+from imu_calibration.document import files
 
 FULL = '''
 import resource, sys
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-from imu_calibration import files
-from imu_calibration.errors import InputError
+from imu_calibration.document import files
+from imu_calibration.core.errors import InputError
 try:
     files.write_whole(sys.argv[1], b'x' * 5000)
 except InputError as error:

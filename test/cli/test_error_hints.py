@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imu_calibration.by_hand.status import Findings, hand_status
-from imu_calibration.calibration.status import COMMON_SCALE
+from imu_calibration.calibration.pose_scan import Findings, hand_status
 from imu_calibration.cli.main import main
 from imu_calibration.cli.parser import VERBS, hints_of, make_parser
-from imu_calibration.errors import KEYS, InputError, with_hint
-from imu_calibration.errors import VERBS as PROGRAMS
+from imu_calibration.core.errors import KEYS, InputError, with_hint
+from imu_calibration.core.errors import VERBS as PROGRAMS
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.estimation.status import COMMON_SCALE
 from imu_calibration.nodes.parameters import HINTS
-from imu_calibration.preflight.joint_checks import check_force
-from imu_calibration.samples import ImuSamples
+from imu_calibration.preprocessing.joint_checks import check_force
 from msg_adapters.write import write_session
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,7 +9,7 @@ import pytest
 from imu_calibration.cli import main as main_module
 from imu_calibration.cli import parser
 from imu_calibration.cli.main import main
-from imu_calibration.progress import listening, report, reported
+from imu_calibration.core.progress import listening, report, reported
 
 ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
 SESSION, TABLE, TRUTH = (f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml'))
@@ -34,7 +34,7 @@ def test_an_inspection_imports_neither_the_search_nor_slow_libraries():
     program = ('import sys\nfrom imu_calibration.cli.main import main\nmain(sys.argv[1:])\nprint(*sys.modules, file=sys.stderr)')
     done = subprocess.run([sys.executable, '-c', program, 'inspect', SESSION], cwd=ROOT, capture_output=True, text=True, check=True)
     assert not set(done.stderr.split()) & {'scipy.interpolate', 'scipy.optimize', 'scipy.stats', 'scipy.signal', 'matplotlib', 'rclpy', 'jinja2',
-                                           'imu_calibration.by_hand.inquiry', 'imu_calibration.use_cases.calibrate'}
+                                           'imu_calibration.references.gravity.model_selection', 'imu_calibration.use_cases.calibrate'}
 
 
 @pytest.mark.parametrize('verb', parser.VERBS)

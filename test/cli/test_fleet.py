@@ -8,17 +8,17 @@ import pytest
 import yaml
 from refusal import refused
 
-from imu_calibration.calibration.document import Calibration
 from imu_calibration.calibration.fleet import UnitResult, summarise
 from imu_calibration.cli.fleet_run import summary_html, unit_rows
 from imu_calibration.cli.main import main
+from imu_calibration.core.errors import InputError
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.files import read_calibration
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import InputError
-from imu_calibration.files import read_calibration
-from imu_calibration.reference.table import Table
-from imu_calibration.resources import config_file
+from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.use_cases.resources import config_file
 from msg_adapters.write import write_session
 
 TABLE_FILE = config_file('table_simulated.yaml')

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from refusal import refused as expected
 
-from imu_calibration.by_hand.sample_store import HandStore
 from imu_calibration.calibration.accumulator_state import saved_model
-from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.cli.fleet_run import csv_text, unit_rows
-from imu_calibration.documents import from_text
-from imu_calibration.errors import DocumentError, InputError
-from imu_calibration.exports.export import export, find_target
-from imu_calibration.files import make_folder, write_text
-from imu_calibration.reference.urdf import root_of
+from imu_calibration.core.documents import from_text
+from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.exports.export import export, find_target
+from imu_calibration.document.files import make_folder, write_text
+from imu_calibration.kinematics.urdf import root_of
+from imu_calibration.references.gravity.sample_store import HandStore
 from imu_calibration.report.figures import draw
 from msg_adapters.imu import IMU_TYPE
 

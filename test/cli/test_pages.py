@@ -10,7 +10,7 @@ import pytest
 
 import imu_calibration
 from imu_calibration.cli.main import main
-from imu_calibration.samples import ImuSamples
+from imu_calibration.core.samples import ImuSamples
 from msg_adapters.write import write_session
 
 from worlds.hand_sessions import simulate

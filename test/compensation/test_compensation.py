@@ -5,17 +5,17 @@ import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.document import Calibration
 from imu_calibration.compensation.compensate import Transfer, compensate, invertible, outside_conditions
 from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.stream import CompensationStream, derivative_for, refuse_corrected, requested_transfer
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, TemperatureSamples
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.forward_equations import predict, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import InputError
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.reference_motion import Reference
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, TemperatureSamples
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 
 from worlds.compensation_cases import FURTHER, random_calibration, random_motion

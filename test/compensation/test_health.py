@@ -20,7 +20,7 @@ from imu_calibration.compensation.health import (
     StopWatch,
 )
 from imu_calibration.compensation.stops import LONGEST, Stop, StopDetector
-from imu_calibration.constants import DEG
+from imu_calibration.core.constants import DEG
 
 from worlds.drives import RATE, SD, G, drive, plain_calibration
 

@@ -13,8 +13,8 @@ from imu_calibration.compensation.angular_acceleration import WARM_UP
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.compensation.stream import CompensationStream
+from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.nodes.message_compensation import LiveCompensation
-from imu_calibration.samples import ImuSamples, TemperatureSamples
 from msg_adapters.encode import encode_imu
 from msg_adapters.imu import FIELDS, N_DOUBLES, parse_imu, patch_imu
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from imu_calibration.compensation.angular_acceleration import CausalDerivative, TimedDerivative
 from imu_calibration.compensation.rate_slope import RateSlope
 from imu_calibration.compensation.stream import CompensationStream, derivative_for
+from imu_calibration.core.samples import ImuSamples
 from imu_calibration.nodes.message_compensation import LiveCompensation
-from imu_calibration.samples import ImuSamples
-from imu_calibration.segmentation.stamping import COUNTED, IRREGULAR, REGULAR, describe_stamps
+from imu_calibration.preprocessing.stamping import COUNTED, IRREGULAR, REGULAR, describe_stamps
 from msg_adapters.encode import encode_imu
 from msg_adapters.imu import FIELDS, parse_imu, patch_imu
 

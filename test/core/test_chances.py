@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from imu_calibration.chances import chi2_isf, chi2_sf, f_sf, norm_ppf, norm_sf
+from imu_calibration.core.distributions import chi2_isf, chi2_sf, f_sf, norm_ppf, norm_sf
 
 RNG = np.random.default_rng(1)
 VALUES = np.concatenate([RNG.exponential(10.0, 300), RNG.normal(0.0, 3.0, 200), [0.0, 1e-300, 1e300, np.inf, -np.inf, np.nan]])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.samples import runs_of
+from imu_calibration.core.samples import runs_of
 
 
 @pytest.mark.parametrize('seed', range(5))

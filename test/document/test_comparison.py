@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.comparison import LEVEL, compare
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_text import calibration_to_text
-from imu_calibration.calibration.status import DETERMINED, HELD
 from imu_calibration.cli.main import main
+from imu_calibration.core.errors import InputError
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.comparison import LEVEL, compare
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import InputError
+from imu_calibration.estimation.status import DETERMINED, HELD
 
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
 COUNT = len(MODEL.param_names)

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration import documents
-from imu_calibration.calibration import trust
-from imu_calibration.calibration.document_text import calibration_to_text, checked_tolerances, from_mapping, to_mapping
 from imu_calibration.compensation.compensate import outside_conditions
-from imu_calibration.errors import InputError
+from imu_calibration.core import documents
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.document import trust
+from imu_calibration.document.calibration_text import calibration_to_text, checked_tolerances, from_mapping, to_mapping
+from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.message_compensation import LiveCompensation
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples
 from msg_adapters.encode import encode_imu
 from msg_adapters.imu import FIELDS, parse_imu
 
@@ -133,8 +133,8 @@ def test_no_damaged_field_gets_through(part):
 ATTACKS = '''
 import resource
 resource.setrlimit(resource.RLIMIT_AS, (2 * 10**9, 2 * 10**9))
-from imu_calibration.calibration.document_text import calibration_from_text
-from imu_calibration.errors import InputError
+from imu_calibration.document.calibration_text import calibration_from_text
+from imu_calibration.core.errors import InputError
 laughs = "".join(f"a{k}: &a{k} [{', '.join(['*a' + str(k - 1)] * 10)}]\\n" for k in range(1, 12))
 texts = {
     'brackets': '[' * 200_000, 'braces': '{a: ' * 100_000, 'dashes': '- ' * 100_000, 'questions': '? ' * 100_000,

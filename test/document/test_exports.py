@@ -14,21 +14,21 @@ from scipy.io import loadmat
 
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures
 from imu_calibration.allan.terms import Term
-from imu_calibration.calibration.comparison import compare
-from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.compensate import compensate
+from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.core.units import error_text
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.comparison import compare
+from imu_calibration.document.exports.affine import holding_of, lower_times_rotation, upper_times_rotation
+from imu_calibration.document.exports.export import UNIT, all_targets, export, find_reader, find_target, loss_lines
+from imu_calibration.document.exports.imported import import_file
+from imu_calibration.document.exports.loss import NOTHING, motion_of, standard_motion
+from imu_calibration.document.exports.target import Readings
+from imu_calibration.document.exports.targets_page import rendered
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import sensor_output
-from imu_calibration.errors import DocumentError, InputError
-from imu_calibration.exports.affine import holding_of, lower_times_rotation, upper_times_rotation
-from imu_calibration.exports.export import UNIT, all_targets, export, find_reader, find_target, loss_lines
-from imu_calibration.exports.imported import import_file
-from imu_calibration.exports.loss import NOTHING, motion_of, standard_motion
-from imu_calibration.exports.page import rendered
-from imu_calibration.exports.target import Readings
-from imu_calibration.reference.reference_motion import Reference, lever_matrix
-from imu_calibration.units import error_text
+from imu_calibration.kinematics.reference_motion import Reference, lever_matrix
 
 from worlds import export_formulas as programs
 from worlds.compensation_cases import FURTHER, random_calibration, random_motion

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.decision import HELPS, UNPROVEN
-from imu_calibration.calibration.document import Calibration, parameter_rows
-from imu_calibration.calibration.statements import DECISION, NOTE, PARAMETERS, WARNING
-from imu_calibration.calibration.status import DETERMINED, HELD, WEAK, tolerances_of
-from imu_calibration.calibration.verdict import judge, judged
+from imu_calibration.document.calibration import Calibration, parameter_rows
+from imu_calibration.document.decision import HELPS, UNPROVEN
+from imu_calibration.document.statements import DECISION, NOTE, PARAMETERS, WARNING
+from imu_calibration.document.verdict import judge, judged
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.status import DETERMINED, HELD, WEAK, tolerances_of
 
 MODEL = SensorModel(reference=('table_tilt',))
 NAMES = list(MODEL.param_names)

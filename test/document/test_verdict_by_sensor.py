@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration import files
-from imu_calibration.calibration import trust
-from imu_calibration.calibration.decision import HARMS as HARMFUL
-from imu_calibration.calibration.decision import HELPS, UNPROVEN
-from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
-from imu_calibration.calibration.nominal import with_nominal
 from imu_calibration.cli.main import main
+from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock
+from imu_calibration.document import files, trust
+from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
+from imu_calibration.document.decision import HARMS as HARMFUL
+from imu_calibration.document.decision import HELPS, UNPROVEN
+from imu_calibration.document.exports.export import export, find_target
+from imu_calibration.document.nominal import with_nominal
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.exports.export import export, find_target
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock
+from imu_calibration.kinematics.table import Table
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 

@@ -15,9 +15,11 @@ from refusal import refused
 
 import imu_calibration as imu
 from imu_calibration.calibration.accumulator_state import from_bytes, to_bytes
-from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
 from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.stream import CompensationStream
+from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.effects.base import Effect
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.column_group import ColumnGroup
@@ -25,9 +27,7 @@ from imu_calibration.effects.forward_equations import coefficient_jacobian, coef
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.effects.term import from_definition, term
 from imu_calibration.effects.tolerance_file import rendered
-from imu_calibration.errors import DocumentError, InputError
-from imu_calibration.reference.reference_motion import Reference
-from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.kinematics.reference_motion import Reference
 
 ROOT = Path(__file__).resolve().parents[2]
 ALSO_WORDS = {'bias', 'matrix'}

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.plausibility import beyond_known
-from imu_calibration.constants import STANDARD_GRAVITY as G
-from imu_calibration.diagnosis.live import describe
+from imu_calibration.calibration.diagnosis.live_diagnosis import describe
+from imu_calibration.core.constants import STANDARD_GRAVITY as G
+from imu_calibration.document.plausibility import beyond_known
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.table import Table
 
 from worlds import physics
 

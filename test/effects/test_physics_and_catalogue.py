@@ -9,9 +9,9 @@ import pytest
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.signal_history import BandVariance, ThermalBranch
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch
+from imu_calibration.kinematics.table import Table
 
 from worlds.hiding import options_of
 from worlds.physics import encoder_reading, make_session

@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration import documents, files
+from imu_calibration.calibration.diagnosis.sentences import sentence
 from imu_calibration.cli.main import main
-from imu_calibration.diagnosis.sentences import sentence
+from imu_calibration.core import documents
+from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document import files
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.column_group import ColumnGroup
 from imu_calibration.effects.expressions import PLACES, read
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.effects.term import term
-from imu_calibration.errors import ImuCalibrationError, InputError
-from imu_calibration.reference.reference_motion import Reference
-from imu_calibration.samples import SampleBlock
+from imu_calibration.kinematics.reference_motion import Reference
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values, simulate
@@ -180,7 +181,7 @@ def test_whatever_a_file_says_it_does_arithmetic_or_nothing():
 @pytest.mark.live
 def test_the_node_reads_the_file(mine):
     program = ('import sys, rclpy\nfrom imu_calibration.nodes.calibration_node import CalibrationNode\n'
-               'from imu_calibration.resources import config_file\n'
+               'from imu_calibration.use_cases.resources import config_file\n'
                'given = {"effects_file": sys.argv[1], "table_file": config_file("table_simulated.yaml"),\n'
                '         "gyroscope_model": "bias+matrix+gyro_warm_force"}\n'
                'rclpy.init(args=["--ros-args", *(part for name, value in given.items() for part in ("-p", f"{name}:={value}"))])\n'

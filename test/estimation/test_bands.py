@@ -9,9 +9,9 @@ from imu_calibration.estimation.band_misfit import band_misfit, misfit_along
 from imu_calibration.estimation.noise_model import MovingFactors, NoiseModel
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_window, slow_part
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
 
 TABLE = Table.from_mapping({'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1], 'gravity': 9.80665, 'latitude': None})
 MODEL = SensorModel(joint_names=('shaft',))

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.accumulator_state import from_bytes, to_bytes
-from imu_calibration.calibration.gathered import Gathered
-from imu_calibration.calibration.verdict_notes import _left_out
+from imu_calibration.document.verdict_notes import _left_out
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import WindowKind
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import WindowKind
+from imu_calibration.references.turntable.gathered import Gathered
 
 from worlds.misfit_coverage import calibrated
 from worlds.misfit_worlds import make_pair

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.core.errors import NotObservableError
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.columns import References, columns
 from imu_calibration.effects.forward_equations import coefficients, predict
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import NotObservableError
 from imu_calibration.estimation import noise_model
 from imu_calibration.estimation.accumulator import Accumulator, restrict
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_window
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import SampleBlock
-from imu_calibration.segmentation.window import Window
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, gauss_markov
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate

@@ -7,16 +7,16 @@ import pytest
 
 import imu_calibration
 from imu_calibration.calibration.by_evidence import _named_elsewhere
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.columns import columns
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_window
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import SampleBlock
-from imu_calibration.segmentation.window import Window
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.accumulator_state import from_bytes, to_bytes
-from imu_calibration.calibration.gathered import Gathered
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import accumulator as accumulator_module
@@ -14,7 +13,8 @@ from imu_calibration.estimation.accumulator import Accumulator, restrict
 from imu_calibration.estimation.model_error import LEAST_BLOCKS, NO_BIAS, Waves, errors_of_waves
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable.gathered import Gathered
 
 from worlds.misfit_coverage import base_sd, calibrated, errors_in_sd
 from worlds.misfit_worlds import make_pair

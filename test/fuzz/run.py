@@ -56,7 +56,7 @@ class Record:
 
 def read_inputs(reader, seeds, seed, folder, *, goes_on, before=lambda data: None):
     """Read mutations of `seeds` while `goes_on(record)` holds; `before` is called with each input. Return the Record."""
-    from imu_calibration.errors import ImuCalibrationError
+    from imu_calibration.core.errors import ImuCalibrationError
     rng, record = random.Random(seed), Record()
     inputs = list(seeds)
     while inputs or goes_on(record):

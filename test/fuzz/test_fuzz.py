@@ -3,7 +3,7 @@
 import pytest
 from fuzz import readers, run
 
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 
 N_INPUTS = 40
 

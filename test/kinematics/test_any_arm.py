@@ -7,13 +7,13 @@ import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.errors import InputError
-from imu_calibration.reference.joint import JointLimits, JointNames
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.table import Table
-from imu_calibration.reference.urdf import table_from_urdf
+from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.joint import JointLimits, JointNames
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.table import Table
+from imu_calibration.kinematics.urdf import table_from_urdf
 
 from worlds.arms import FOLLOWING, GANTRY, ROBOTS, SCARA, SIX_AXES, joint, robot
 

@@ -5,10 +5,10 @@ import pytest
 from refusal import refused
 from scipy.interpolate import BSpline
 
-from imu_calibration.errors import InputError
-from imu_calibration.reference.joint_curve import JointSettings, check_velocity, fit_joint_curve
-from imu_calibration.reference.joint_motion import JointMotion, encoder_step, with_encoder_harmonics
-from imu_calibration.reference.smoothing import (
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.joint_curve import JointSettings, check_velocity, fit_joint_curve
+from imu_calibration.kinematics.joint_motion import JointMotion, encoder_step, with_encoder_harmonics
+from imu_calibration.kinematics.smoothing import (
     Knots,
     PenalisedSpline,
     design_matrix,

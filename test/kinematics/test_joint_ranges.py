@@ -6,17 +6,17 @@ import yaml
 from refusal import refused
 
 from imu_calibration.cli.main import main
-from imu_calibration.driving.campaign import Campaign, CampaignSettings
-from imu_calibration.driving.path_watch import at_rest
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.motion_limits import limit_words, limits_of, missing_ranges, range_warnings
+from imu_calibration.kinematics.table import Table
+from imu_calibration.kinematics.urdf import table_from_urdf
+from imu_calibration.planning.campaign import Campaign, CampaignSettings
+from imu_calibration.planning.path_watch import at_rest
 from imu_calibration.planning.planner import NextMotion, make_planner
 from imu_calibration.planning.situation import noise_of_grade
-from imu_calibration.reference.motion_limits import limit_words, limits_of, missing_ranges, range_warnings
-from imu_calibration.reference.table import Table
-from imu_calibration.reference.urdf import table_from_urdf
-from imu_calibration.resources import config_file
 from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
 from imu_calibration.simulation.sensor_noise import GRADES
+from imu_calibration.use_cases.resources import config_file
 
 from worlds.arms import SIX_AXES
 

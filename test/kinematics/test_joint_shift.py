@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.reference.joint_motion import JointMotion, shifted
+from imu_calibration.kinematics.joint_motion import JointMotion, shifted
 
 NAMES = ('position', 'rate', 'acceleration', 'jerk')
 

@@ -5,14 +5,14 @@ import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
-from imu_calibration import navigation
-from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.errors import InputError
+from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics import strapdown
+from imu_calibration.kinematics.reference_motion import Reference
 from imu_calibration.papers import zhang2017 as zhang
 from imu_calibration.papers import zhang2017_joint_fit as zhang_designs
 from imu_calibration.papers import zhang2017_joint_fit as zhang_joint
 from imu_calibration.papers import zhang2017_navigation as zhang_claims
-from imu_calibration.reference.reference_motion import Reference
 
 from worlds.figures import show
 
@@ -30,7 +30,7 @@ def reference_of(motion, gravity=G):
 def test_attitude_of_a_constant_turn_is_exact_and_stays_orthonormal():
     time = np.linspace(0, 20, 4001)
     rate = np.array([0.4, -1.1, 0.7])
-    mat_ns = navigation.integrate_attitude(time, np.tile(rate, (len(time), 1)))
+    mat_ns = strapdown.integrate_attitude(time, np.tile(rate, (len(time), 1)))
     np.testing.assert_allclose(mat_ns, Rotation.from_rotvec(np.outer(time, rate)).as_matrix(), atol=1e-11)
     np.testing.assert_allclose(mat_ns[-1] @ mat_ns[-1].T, np.eye(3), atol=1e-11)
 
@@ -43,7 +43,7 @@ def test_attitude_of_coning_converges_with_the_square_of_the_step():
         tip = np.column_stack([np.cos(spin * time), np.sin(spin * time), 0 * time])
         exact = Rotation.from_rotvec(half * tip).as_matrix()
         across = np.sin(half) * np.column_stack([-np.sin(spin * time), np.cos(spin * time), 0 * time])
-        mat_ns = navigation.integrate_attitude(time, spin * (across - [0, 0, 1 - np.cos(half)]), exact[0])
+        mat_ns = strapdown.integrate_attitude(time, spin * (across - [0, 0, 1 - np.cos(half)]), exact[0])
         return np.max(np.abs(mat_ns - exact))
 
     coarse, fine = error(0.02), error(0.01)
@@ -55,18 +55,18 @@ def test_earth_rate_turns_the_level_frame():
     time, earth = np.linspace(0, 1000, 2001), np.array([4.6e-5, -1e-5, 5.6e-5])
     start = Rotation.from_rotvec([0.3, -0.5, 1.0]).as_matrix()
     rate_s = np.tile(start.T @ earth, (len(time), 1))
-    mat_ns = navigation.integrate_attitude(time, rate_s, start, earth_rate_n=earth)
+    mat_ns = strapdown.integrate_attitude(time, rate_s, start, earth_rate_n=earth)
     np.testing.assert_allclose(mat_ns, np.broadcast_to(start, mat_ns.shape), atol=1e-12)
 
 
 def test_dead_reckoning_of_constant_and_circular_motion():
     time = np.linspace(0, 10, 2001)
-    velocity, position = navigation.dead_reckon(time, np.tile([0.2, 0, G], (len(time), 1)), G)
+    velocity, position = strapdown.dead_reckon(time, np.tile([0.2, 0, G], (len(time), 1)), G)
     np.testing.assert_allclose(velocity[:, 0], 0.2 * time, atol=1e-12)
     np.testing.assert_allclose(position[-1], [10.0, 0, 0], atol=1e-9)
-    assert navigation.constant_error_growth(0.2, 10.0) == pytest.approx((2.0, 10.0))
+    assert strapdown.constant_error_growth(0.2, 10.0) == pytest.approx((2.0, 10.0))
     swing = np.column_stack([np.sin(2 * time), 0 * time, np.full(len(time), G)])
-    velocity, position = navigation.dead_reckon(time, swing, G)
+    velocity, position = strapdown.dead_reckon(time, swing, G)
     np.testing.assert_allclose(velocity[:, 0], (1 - np.cos(2 * time)) / 2, atol=1e-5)
     np.testing.assert_allclose(position[:, 0], time / 2 - np.sin(2 * time) / 4, atol=1e-4)
 
@@ -74,22 +74,22 @@ def test_dead_reckoning_of_constant_and_circular_motion():
 def test_drift_is_zero_for_perfect_samples_and_follows_one_fault():
     motion = zhang_claims.tumble((20, 20, 20), (0.3, 0.4, 0.5), seconds=20, sample_rate=100)
     reference = reference_of(motion)
-    clean = navigation.drift_over(reference, reference.force_s, reference.rate_s, seconds=5.0)
+    clean = strapdown.drift_over(reference, reference.force_s, reference.rate_s, seconds=5.0)
     assert len(clean.start) == 4 and clean.median() == (0.0, 0.0, 0.0)
-    turned = navigation.drift_over(reference, reference.force_s, reference.rate_s + [1e-4, 0, 0], seconds=5.0)
+    turned = strapdown.drift_over(reference, reference.force_s, reference.rate_s + [1e-4, 0, 0], seconds=5.0)
     assert 4e-4 < turned.median()[2] < 5e-4  # the axis of the fault turns with the body, so a little less than rate times time
     still = Reference(np.arange(0, 100.01, 0.01), np.tile(np.eye(3), (10001, 1, 1)), np.tile([0, 0, G], (10001, 1)),
                       np.zeros((10001, 3)), np.zeros((10001, 3)), G)
-    pushed = navigation.drift_over(still, still.force_s + [0.01, 0, 0], still.rate_s, seconds=50.0)
+    pushed = strapdown.drift_over(still, still.force_s + [0.01, 0, 0], still.rate_s, seconds=50.0)
     np.testing.assert_allclose(pushed.velocity, 0.5, rtol=1e-9)
     np.testing.assert_allclose(pushed.position, 12.5, rtol=1e-9)
     with refused(InputError, 'too_short', 50):
-        navigation.drift_over(still.select(slice(0, 100)), still.force_s[:100], still.rate_s[:100])
+        strapdown.drift_over(still.select(slice(0, 100)), still.force_s[:100], still.rate_s[:100])
 
 
 def test_wrong_times_are_refused():
     with refused(InputError, 'shape_and_times'):
-        navigation.integrate_attitude(np.array([0.0, 0.0]), np.zeros((2, 3)))
+        strapdown.integrate_attitude(np.array([0.0, 0.0]), np.zeros((2, 3)))
 
 
 def test_n1_static_navigation_without_drift():
@@ -110,16 +110,16 @@ def test_n1_static_navigation_with_the_sensors_own_drift():
 
 def test_n1_table_2_explains_the_printed_curve():
     """The printed 4 m/s and 100 m are the z channel before compensation after 47.4 s."""
-    velocity, position = navigation.constant_error_growth(abs(zhang.TABLE_2_G[2, 0]) * G, 47.4)
+    velocity, position = strapdown.constant_error_growth(abs(zhang.TABLE_2_G[2, 0]) * G, 47.4)
     show('N1', 'Table 2 z before, 47.4 s: m/s, m', [velocity, position], '4.23 100.4')
     assert (velocity, position) == (pytest.approx(4.23, abs=0.01), pytest.approx(100.4, abs=0.1))
 
 
 def test_n2_a_spin_about_a_body_axis_does_not_drift():
     growth = zhang_claims.spin_growth(COSINES, ARMS, (1, 0, 0))
-    level, body = navigation.largest(growth['level'][0]), navigation.largest(growth['body'][0])
+    level, body = strapdown.largest(growth['level'][0]), strapdown.largest(growth['body'][0])
     show('N2', 'x spin 100 deg/s, 100 s: level frame, body sum, m/s', [level, body], '0.048 3.69 (+-2 %)')
-    show('N2', 'positions, m', [navigation.largest(growth['level'][1]), navigation.largest(growth['body'][1])], '2.4 185')
+    show('N2', 'positions, m', [strapdown.largest(growth['level'][1]), strapdown.largest(growth['body'][1])], '2.4 185')
     assert (level, body) == (pytest.approx(0.048, rel=0.02), pytest.approx(3.69, rel=0.02))
 
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
+from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
 from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import CompensationStream
-from imu_calibration.diagnosis.diagnose import diagnose
+from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.reference.signal_history import HALF_WIDTH, ThermalBranch
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, SampleBlock, TemperatureSamples
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.kinematics.signal_history import HALF_WIDTH, ThermalBranch
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.selection.questions import testable_effects as asked_of
 
 from worlds.compensation_cases import random_calibration

@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.errors import InputError
-from imu_calibration.files import read_table
-from imu_calibration.reference.earth import earth_rate_n, normal_gravity
-from imu_calibration.reference.joint import TYPES, Joint, Mimic
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.perturbed_table import tilt, with_axis_angles
-from imu_calibration.reference.reference_motion import skew
-from imu_calibration.reference.table import Table, axis_error_directions
-from imu_calibration.resources import config_file
+from imu_calibration.core.errors import InputError
+from imu_calibration.document.files import read_table
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.earth import earth_rate_n, normal_gravity
+from imu_calibration.kinematics.joint import TYPES, Joint, Mimic
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.perturbed_table import tilt, with_axis_angles
+from imu_calibration.kinematics.reference_motion import skew
+from imu_calibration.kinematics.table import Table, axis_error_directions
+from imu_calibration.use_cases.resources import config_file
 
 THREE_AXES = {'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
               'gravity': 9.81}

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
+from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
 from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import CompensationStream
-from imu_calibration.diagnosis.diagnose import diagnose
+from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_at_rest import white_noise
 from imu_calibration.estimation.window_statistics import reduce_windows
-from imu_calibration.reference.signal_history import BandVariance
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, SampleBlock
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.kinematics.signal_history import BandVariance
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.selection.questions import testable_effects as asked_of
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise

@@ -5,8 +5,8 @@ import pytest
 from refusal import refused
 from rosbags.highlevel import AnyReader
 
-from imu_calibration.errors import InputError
-from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 

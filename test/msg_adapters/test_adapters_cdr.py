@@ -8,8 +8,8 @@ from refusal import refused
 from rosbags.typesys import Stores, get_typestore
 from test_adapters_bag import make_session
 
-from imu_calibration.errors import InputError
-from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.definitions import deserializer, is_standard, standard_definition
 from msg_adapters.encode import encode_imu, encode_joints, encode_temperature

@@ -8,7 +8,7 @@ from refusal import refused
 from rosbags.highlevel import AnyReader
 from test_adapters_bag import make_session
 
-from imu_calibration.errors import InputError
+from imu_calibration.core.errors import InputError
 from msg_adapters.copying import copy_with_corrected
 from msg_adapters.imu import FIELDS, parse_imu, patch_imu
 from msg_adapters.write import write_session

@@ -12,8 +12,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_adapters_bag import make_session
 
-from imu_calibration.errors import InputError
-from imu_calibration.samples import ImuSamples, JointSamples
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.compressed import zstd
 from msg_adapters.definitions import standard_definition

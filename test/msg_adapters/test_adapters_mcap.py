@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_adapters_bag import make_session
 
-from imu_calibration.samples import ImuSamples
+from imu_calibration.core.samples import ImuSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.definitions import standard_definition
 from msg_adapters.encode import encode_imu, encode_joints

@@ -10,8 +10,8 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.typesys import Stores, get_typestore
 from test_adapters_bag import make_session
 
-from imu_calibration.errors import InputError
-from imu_calibration.samples import ImuSamples, JointSamples
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.copying import copy_with_corrected
 from msg_adapters.encode import encode_imu, encode_joints

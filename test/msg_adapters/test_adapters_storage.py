@@ -11,8 +11,8 @@ from refusal import refused
 
 from imu_calibration.cli.fleet_run import is_bag
 from imu_calibration.cli.main import main
-from imu_calibration.errors import InputError
-from imu_calibration.samples import ImuSamples, JointSamples
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.copying import copy_with_corrected
 from msg_adapters.layout import Packed

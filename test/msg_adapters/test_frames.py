@@ -5,8 +5,8 @@ import pytest
 from refusal import refused
 
 from imu_calibration.cli.main import main
-from imu_calibration.errors import InputError
-from imu_calibration.samples import ImuSamples
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples
 from imu_calibration.use_cases.compensate import compensate
 from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter

@@ -11,8 +11,8 @@ import pytest
 import yaml
 from test_adapters_mcap import chunk, message, record, text, write_file
 
-from imu_calibration.documents import parsed
-from imu_calibration.errors import InputError
+from imu_calibration.core.documents import parsed
+from imu_calibration.core.errors import InputError
 from msg_adapters.bag import list_topics
 from msg_adapters.compressed import LARGEST_CHUNK, decompress_message, zstd
 from msg_adapters.decode import Decoder, JointDecoder
@@ -267,7 +267,7 @@ def test_long_names_take_no_quadratic_time():
 
 def decode_long_names(imu):
     """Decode messages of long names; return 0."""
-    from imu_calibration.samples import ImuSamples, JointSamples
+    from imu_calibration.core.samples import ImuSamples, JointSamples
     imu = ImuSamples(imu.stamp_ns, imu.force_s, imu.rate_s)
     messages = [encode_imu(imu.select(slice(k, k + 1)), frame_id='x' * (1 << 22) + str(k))[0].tobytes() for k in range(4)]
     decoder = Decoder(IMU_TYPE)

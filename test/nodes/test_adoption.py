@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.document_text import calibration_to_text
-from imu_calibration.errors import DocumentError
+from imu_calibration.core.errors import DocumentError
+from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.nodes import adoption
 from imu_calibration.nodes.adoption import adopt, again
 from imu_calibration.nodes.compensator_settings import CompensatorSettings

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.document_text import calibration_from_text
+from imu_calibration.document.calibration_text import calibration_from_text
 from msg_adapters.encode import encode_imu, encode_joints, rows
 
 from worlds.live_sessions import make_session

@@ -9,10 +9,10 @@ import yaml
 from test_by_hand import GRAVITY, simulate
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
-from imu_calibration.calibration.document_text import calibration_from_text, calibration_to_text
-from imu_calibration.diagnosis.workflow import diagnose_recording
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.table import Table
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import START_NS
 from msg_adapters.bag import open_recording
@@ -22,7 +22,7 @@ from worlds import physics
 from worlds.live_sessions import OPTIONS, TABLE, assert_same, make_session
 
 pytest.importorskip('rclpy')
-from imu_calibration.by_hand.workflow import calibrate_without_table
+from imu_calibration.calibration.hand_workflow import calibrate_without_table
 
 from ros.live_station import Station, taken  # noqa: E402
 

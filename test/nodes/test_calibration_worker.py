@@ -5,14 +5,14 @@ from types import SimpleNamespace
 import pytest
 
 from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.files import read_table
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document.files import read_table
 from imu_calibration.nodes import calibration_worker
 from imu_calibration.nodes.calibration_worker import IDLE, CalibrationWorker
 from imu_calibration.nodes.session_files import SessionFiles
 from imu_calibration.nodes.worker_requests import Listeners
-from imu_calibration.preflight.stream_watch import SILENT_AFTER
-from imu_calibration.resources import config_file
-from imu_calibration.samples import SampleBlock
+from imu_calibration.preprocessing.stream_watch import SILENT_AFTER
+from imu_calibration.use_cases.resources import config_file
 
 from worlds.physics import make_session
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.document_text import calibration_to_text
-from imu_calibration.documents import version_of
+from imu_calibration.core.documents import version_of
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.base import Role
-from imu_calibration.errors import InputError
-from imu_calibration.samples import ImuSamples
-from imu_calibration.segmentation.stamping import COUNTED, StampLine
+from imu_calibration.preprocessing.stamping import COUNTED, StampLine
 from msg_adapters.encode import encode_imu
 
 from worlds.compensation_cases import random_calibration

@@ -5,14 +5,14 @@ import pytest
 pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 
+from imu_calibration.calibration.diagnosis.live_diagnosis import DiagnosisState  # noqa: E402
 from imu_calibration.calibration.effect_states import GroupState  # noqa: E402
-from imu_calibration.diagnosis.live import DiagnosisState  # noqa: E402
 from imu_calibration.nodes.calibration_guide import PATIENCE, CalibrationGuide  # noqa: E402
 from imu_calibration.nodes.calibration_state import WorkerState  # noqa: E402
 from imu_calibration.nodes.calibration_status import statuses_of  # noqa: E402
 from imu_calibration.nodes.complaints import MOST_KINDS, REMINDER, Complaints  # noqa: E402
-from imu_calibration.preflight.stream_watch import StreamState  # noqa: E402
-from imu_calibration.segmentation.stamping import COUNTED, StampLine  # noqa: E402
+from imu_calibration.preprocessing.stamping import COUNTED, StampLine  # noqa: E402
+from imu_calibration.preprocessing.stream_watch import StreamState  # noqa: E402
 
 
 class Heard(list):

@@ -6,10 +6,10 @@ pytest.importorskip('rclpy')
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically  # noqa: E402
 from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 
-from imu_calibration.driving.campaign import CampaignSettings  # noqa: E402
-from imu_calibration.driving.driver import DriverSettings  # noqa: E402
+from imu_calibration.core.settings import describe  # noqa: E402
 from imu_calibration.nodes.parameter_files import NODES, settings_of  # noqa: E402
-from imu_calibration.settings import describe  # noqa: E402
+from imu_calibration.planning.campaign import CampaignSettings  # noqa: E402
+from imu_calibration.planning.driver import DriverSettings  # noqa: E402
 
 from ros.live_station import ROOT, TABLE, Station  # noqa: E402
 from ros.planner_bench import PlannerBench  # noqa: E402

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.document_text import calibration_to_text
-from imu_calibration.constants import DEG
+from imu_calibration.core.constants import DEG
+from imu_calibration.document.calibration_text import calibration_to_text
 from msg_adapters.encode import encode_imu, rows
 from msg_adapters.imu_stream import ImuStream
 

@@ -8,8 +8,8 @@ from types import ModuleType
 import pytest
 import yaml
 
+from imu_calibration.core.settings import describe
 from imu_calibration.nodes.parameter_files import settings_of
-from imu_calibration.settings import describe
 
 ROOT = Path(__file__).resolve().parents[2]
 

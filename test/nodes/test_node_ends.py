@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from refusal import refused
 
+from imu_calibration.core.settings import describe
 from imu_calibration.nodes.early_end import is_node_process
 from imu_calibration.nodes.parameter_files import settings_of
-from imu_calibration.settings import describe
 
 from ros.live_station import TABLE, Station
 
@@ -89,7 +89,7 @@ sys.exit(run_node(lambda: rclpy.create_node('ends'), [], spin=spin))
 
 @pytest.mark.parametrize(('what', 'code', 'words'), (
     ("raise ValueError('nobody foresaw this')", 1, 'error: the node cannot continue: ValueError: nobody foresaw this\n'),
-    ("raise __import__('imu_calibration.errors', fromlist=['x']).InputError('a bag must be there; name one')", 1, 'error: a bag must be there; name one\n'),
+    ("raise __import__('imu_calibration.core.errors', fromlist=['x']).InputError('a bag must be there; name one')", 1, 'error: a bag must be there; name one\n'),
     ('node.failed = True', 1, ''), ('pass', 0, '')), ids=('unforeseen', 'refused', 'failed', 'done'))
 def test_a_node_that_cannot_go_on_says_so_and_ends_with_another_code(what, code, words):
     pytest.importorskip('rclpy')
@@ -187,9 +187,9 @@ def test_a_node_without_ros_ends_with_one_line(monkeypatch, capsys):
 
 @pytest.mark.parametrize('module', ['urdf_parser_py.urdf', 'xacro'])
 def test_a_robot_description_without_its_packages_is_refused_with_the_extra(monkeypatch, tmp_path, module):
-    from imu_calibration import files
-    from imu_calibration.errors import InputError
-    from imu_calibration.reference.urdf import table_from_urdf
+    from imu_calibration.core.errors import InputError
+    from imu_calibration.document import files
+    from imu_calibration.kinematics.urdf import table_from_urdf
     monkeypatch.setitem(sys.modules, module, None)
     path = tmp_path / ('arm.xacro' if module == 'xacro' else 'arm.urdf')
     path.write_text('<robot name="a"><link name="base"/></robot>')

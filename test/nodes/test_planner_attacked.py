@@ -6,7 +6,7 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from imu_calibration.driving.driver import DriveState
+from imu_calibration.planning.driver import DriveState
 
 pytest.importorskip('rclpy')
 from action_msgs.msg import GoalStatus, GoalStatusArray  # noqa: E402

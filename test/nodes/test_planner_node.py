@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import yaml
 
-from imu_calibration.errors import InputError
-from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
 
 pytest.importorskip('rclpy')
 from refusal import refused
 
-from imu_calibration.diagnosis.live import FOUND  # noqa: E402
-from imu_calibration.driving.campaign import Suspect  # noqa: E402
-from imu_calibration.driving.driver import DriverSettings, DriveState  # noqa: E402
+from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND  # noqa: E402
 from imu_calibration.nodes import joint_commands  # noqa: E402
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from  # noqa: E402
+from imu_calibration.planning.campaign import Suspect  # noqa: E402
+from imu_calibration.planning.driver import DriverSettings, DriveState  # noqa: E402
 
 from ros.live_station import TABLE, Station  # noqa: E402
 from ros.one_process import OneProcess  # noqa: E402

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from imu_calibration.calibration.document_text import calibration_to_text
+from imu_calibration.document.calibration_text import calibration_to_text
 
 from worlds.compensation_cases import random_calibration
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.document_text import calibration_from_text
-from imu_calibration.samples import ImuSamples
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.document.calibration_text import calibration_from_text
 from msg_adapters.write import write_session
 
 from worlds.live_sessions import assert_same, errors_in_sd, make_session, offline

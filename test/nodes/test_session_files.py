@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from imu_calibration import files
+from imu_calibration.document import files
 from imu_calibration.nodes.session_files import SessionFiles
 
 
@@ -108,7 +108,7 @@ def test_what_is_put_aside_is_never_written_over(tmp_path):
 
 KILLED = '''
 import os, signal, sys
-from imu_calibration import files
+from imu_calibration.document import files
 files.os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 files.write_whole(sys.argv[1], b'half')
 '''

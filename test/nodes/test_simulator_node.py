@@ -6,10 +6,10 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from imu_calibration.errors import InputError
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.motion_limits import MotionLimits
-from imu_calibration.reference.trajectory_points import TrajectoryPoints
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.motion_limits import MotionLimits
+from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
 from imu_calibration.simulation.joint_trajectory import braking_from, trajectory_from
 from imu_calibration.simulation.live import LiveSimulation
 from imu_calibration.simulation.profiles import make_profile

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.document_text import calibration_to_text
-from imu_calibration.samples import ImuSamples
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.document.calibration_text import calibration_to_text
 from msg_adapters.encode import encode_imu
 
 from worlds.compensation_cases import random_calibration

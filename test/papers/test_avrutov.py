@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.papers import avrutov2017 as avrutov
 from imu_calibration.papers import avrutov2017 as avrutov_budget
 from imu_calibration.papers.linear_least_squares import (

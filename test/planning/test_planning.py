@@ -8,16 +8,19 @@ import pytest
 import yaml
 from refusal import refused
 
-from imu_calibration.calibration.document import Calibration
-from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.calibration.options import CalibrationOptions, choose_model
-from imu_calibration.calibration.status import tolerances_of
 from imu_calibration.cli.main import main
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.columns import columns
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
-from imu_calibration.errors import InputError
+from imu_calibration.estimation.status import tolerances_of
 from imu_calibration.estimation.window_statistics import batch_statistics
+from imu_calibration.kinematics.motion_limits import limits_of
+from imu_calibration.kinematics.table import Table
+from imu_calibration.kinematics.urdf import table_from_urdf
 from imu_calibration.planning import belief
 from imu_calibration.planning.belief import SAMPLING, WindowPredictor, exact_information
 from imu_calibration.planning.coordinates import Coordinates
@@ -26,17 +29,14 @@ from imu_calibration.planning.planner import DONE, make_planner
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.separation import make_separator
 from imu_calibration.planning.situation import LEAST_RESTS, Situation, noise_of_grade
-from imu_calibration.reference.motion_limits import limits_of
-from imu_calibration.reference.table import Table
-from imu_calibration.reference.urdf import table_from_urdf
-from imu_calibration.resources import config_file
-from imu_calibration.samples import SampleBlock
+from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.plan import class_in
+from imu_calibration.use_cases.resources import config_file
 from imu_calibration.use_cases.stand import table_of
 from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE
 

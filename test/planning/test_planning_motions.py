@@ -4,10 +4,10 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.motion_limits import limits_of
 from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.repertoire import Repertoire, rest_at, up_at
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.motion_limits import limits_of
 from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
 
 from worlds.random_tables import random_table

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration import files
-from imu_calibration.by_hand.workflow import calibrate_without_table
-from imu_calibration.calibration import collector, verdict
-from imu_calibration.calibration.calibrate import calibrate
+from imu_calibration.calibration import collector
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.diagnosis.workflow import diagnose_recording
-from imu_calibration.errors import ImuCalibrationError
+from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.document import files, verdict
 from imu_calibration.estimation import observability
-from imu_calibration.samples import ImuSamples, SampleBlock
-from imu_calibration.segmentation.stream_cleaning import StreamCheck
+from imu_calibration.preprocessing.stream_cleaning import StreamCheck
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.inspect import inspect
 from imu_calibration.use_cases.recordings import Topics, source_of
 from msg_adapters.bag import Recording

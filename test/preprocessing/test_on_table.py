@@ -8,15 +8,15 @@ import pytest
 from refusal import refused
 
 from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.errors import InputError
-from imu_calibration.preflight.exchanges import _candidates
-from imu_calibration.preflight.joint_checks import _rates
-from imu_calibration.preflight.on_table import _a_period_late, same_motion, signs_or_delay
-from imu_calibration.preflight.standing_still import standing_still
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window, WindowKind
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.exchanges import _candidates
+from imu_calibration.preprocessing.joint_checks import _rates
+from imu_calibration.preprocessing.on_table import _a_period_late, same_motion, signs_or_delay
+from imu_calibration.preprocessing.standing_still import standing_still
+from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.diagnose import diagnose
 

@@ -10,16 +10,16 @@ import yaml
 from refusal import refused
 
 from imu_calibration.cli.main import main
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.errors import InputError
-from imu_calibration.preflight.checks import Preflight
-from imu_calibration.preflight.evidence import GOOD, NOTE, REFUSE, WARNING
-from imu_calibration.preflight.exchanges import match_axes, signed_permutations
-from imu_calibration.preflight.joint_checks import check_force
-from imu_calibration.preflight.value_checks import force_error
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import SampleBlock
-from imu_calibration.segmentation.block_cleaning import BlockCleaner
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.block_cleaning import BlockCleaner
+from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.exchanges import match_axes, signed_permutations
+from imu_calibration.preprocessing.joint_checks import check_force
+from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING
+from imu_calibration.preprocessing.value_checks import force_error
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import random_values, simulate
 from msg_adapters.bag import open_recording
@@ -346,8 +346,8 @@ def test_counts_against_the_joints(capsys, tmp_path, session, table):
     """Seven times too fast is neither deg/s nor rad/s; the joints know."""
     from imu_calibration.calibration.collector import Collector
     from imu_calibration.effects.sensor_model import SensorModel
-    from imu_calibration.preflight.joint_checks import against_joints
-    from imu_calibration.reference.table import Table
+    from imu_calibration.kinematics.table import Table
+    from imu_calibration.preprocessing.joint_checks import against_joints
     model, description = SensorModel(joint_names=session.joints.names), Table.from_mapping(session.table)
     for factor, expected in ((1.0, []), (7.0, ['rate_unit']), (180 / np.pi, ['rate_unit'])):
         collector = Collector(description, model)

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.by_hand.calibrate import calibrate_by_hand
-from imu_calibration.by_hand.options import HandOptions
-from imu_calibration.by_hand.workflow import read_by_hand
-from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, SampleBlock
-from imu_calibration.segmentation.spike_filter import SpikeFilter
+from imu_calibration.calibration.hand_workflow import read_by_hand
+from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.spike_filter import SpikeFilter
+from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
+from imu_calibration.references.gravity.hand_options import HandOptions
 
 from worlds.cleaning import clean_samples
 from worlds.hand_sessions import GRAVITY

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_rate_slope import PERIOD_NS, START, stamps_of
 
-from imu_calibration.preflight.checks import Preflight
-from imu_calibration.samples import ImuSamples, SampleBlock
-from imu_calibration.segmentation.block_cleaning import BlockCleaner
-from imu_calibration.segmentation.sample_times import SampleTimes
-from imu_calibration.segmentation.stamping import COUNTED, IRREGULAR, REGULAR, describe_stamps
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.preprocessing.block_cleaning import BlockCleaner
+from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.sample_times import SampleTimes
+from imu_calibration.preprocessing.stamping import COUNTED, IRREGULAR, REGULAR, describe_stamps
 
 N = 3000
 TRUE = START + PERIOD_NS * np.arange(N)

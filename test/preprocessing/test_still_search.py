@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.errors import InputError
-from imu_calibration.samples import ImuSamples
-from imu_calibration.segmentation.static_detector import find_still
-from imu_calibration.segmentation.window import WindowSettings
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.preprocessing.window import WindowSettings
 
 from worlds.cleaning import clean_samples
 from worlds.hand_trials import vibration

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imu_calibration.samples import ImuSamples, JointSamples, TemperatureSamples
-from imu_calibration.segmentation.stream_cleaning import StreamCheck
+from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 
 from worlds.cleaning import clean_samples
 

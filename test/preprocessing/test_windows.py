@@ -6,16 +6,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusal import refused
 
-from imu_calibration.errors import InputError
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
-from imu_calibration.segmentation.spike_filter import REACH
-from imu_calibration.segmentation.static_detector import find_still
-from imu_calibration.segmentation.stream_alignment import JOINT_WAIT
-from imu_calibration.segmentation.window import WindowSettings
-from imu_calibration.segmentation.window_cutter import SHORTEST, WanderLimit
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.spike_filter import REACH
+from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT
+from imu_calibration.preprocessing.window import WindowSettings
+from imu_calibration.preprocessing.window_cutter import SHORTEST, WanderLimit
+from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 
 START = 1_700_000_000 * 10 ** 9

@@ -14,9 +14,9 @@ from catkin_pkg.package import parse_package
 from refusal import refused
 
 import imu_calibration
-from imu_calibration import resources
+from imu_calibration.core.errors import InputError
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.errors import InputError
+from imu_calibration.use_cases import resources
 
 ROOT = Path(__file__).resolve().parents[2]
 EXECUTABLES = {'imu_calibration', 'calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node'}

@@ -13,10 +13,8 @@ POSITIONAL = ('settings.py',)
 
 
 def modules():
-    """Path and package of every module."""
-    for folder in ('imu_calibration', 'msg_adapters'):
-        for path in sorted((ROOT / folder).rglob('*.py')):
-            yield path, path.relative_to(ROOT).parts[1 if folder == 'imu_calibration' else 0]
+    """Path of every module."""
+    return [path for folder in ('imu_calibration', 'msg_adapters') for path in sorted((ROOT / folder).rglob('*.py'))]
 
 
 def public_functions(path):
@@ -29,7 +27,7 @@ def public_functions(path):
                 yield entry, [*entry.args.posonlyargs, *entry.args.args][bound:]
 
 
-@pytest.mark.parametrize('path', [path for path, _ in modules()], ids=lambda path: path.stem)
+@pytest.mark.parametrize('path', modules(), ids=lambda path: path.stem)
 def test_it_says_its_types(path):
     found = [f'{entry.name} (line {entry.lineno})' for entry, arguments in public_functions(path)
              if any(argument.annotation is None for argument in arguments + entry.args.kwonlyargs)
@@ -37,7 +35,7 @@ def test_it_says_its_types(path):
     assert not found, f'annotate {", ".join(found)}'
 
 
-@pytest.mark.parametrize('path', [path for path, package in modules() if package not in POSITIONAL], ids=lambda path: path.stem)
+@pytest.mark.parametrize('path', [path for path in modules() if path.name not in POSITIONAL], ids=lambda path: path.stem)
 def test_what_comes_after_the_third_argument_is_named(path):
     found = [f'{entry.name} (line {entry.lineno})' for entry, arguments in public_functions(path)
              if len([argument for argument in arguments if argument.arg not in XYZ]) > 3]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.status import HELD, WEAK
+from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.estimation.status import HELD, WEAK
+from imu_calibration.references.options import CalibrationOptions
 
 from worlds.arm_worlds import deviations, in_our_axes, make_arm_world, truth
 from worlds.arms import SEVEN_AXES, SIX_AXES

@@ -8,20 +8,20 @@ import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.by_hand.advice import missing_motion
-from imu_calibration.by_hand.calibrate import calibrate_by_hand
-from imu_calibration.by_hand.equations import Poses, State, TurnData, build_system, moved
-from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence
-from imu_calibration.by_hand.model import unpack
-from imu_calibration.by_hand.options import ByHandSettings, HandOptions, KnownTurn, hand_options
-from imu_calibration.by_hand.preintegration import integrate_turn
-from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.advice import missing_motion
 from imu_calibration.calibration.session import LiveByHandSettings
-from imu_calibration.errors import InputError, NotObservableError
+from imu_calibration.core.errors import InputError, NotObservableError
+from imu_calibration.core.samples import ImuSamples, NominalScaling
 from imu_calibration.estimation.variance_components import estimate_group_variances, student_factor
-from imu_calibration.reference.earth import normal_gravity
-from imu_calibration.samples import ImuSamples, NominalScaling
-from imu_calibration.segmentation.static_detector import find_still
+from imu_calibration.kinematics.earth import normal_gravity
+from imu_calibration.kinematics.preintegration import integrate_turn
+from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.references.gravity.equations import Poses, State, TurnData, build_system, moved
+from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence
+from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
+from imu_calibration.references.gravity.hand_options import ByHandSettings, HandOptions, KnownTurn, hand_options
+from imu_calibration.references.gravity.hand_parameters import unpack
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.choices import calibration_options
 
 from worlds.hand_sessions import FACES, FULL, GRAVITY, NOMINAL, PARAM_NAMES, random_truth, simulate, turn_samples
@@ -365,7 +365,7 @@ def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_se
 # real recordings
 
 def load(recordings, name, topic=None):
-    from imu_calibration.by_hand.workflow import read_imu
+    from imu_calibration.calibration.hand_workflow import read_imu
     from msg_adapters.bag import open_recording
     return read_imu(open_recording(recordings / name, topic, want_joints=False).blocks())[0]
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from imu_calibration.by_hand import poses as poses_module
-from imu_calibration.by_hand.calibrate import calibrate_by_hand
-from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.references.gravity import poses as poses_module
+from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
+from imu_calibration.references.gravity.hand_options import HandOptions
 
 from worlds.hand_sessions import GRAVITY
 from worlds.physics_hand import hold_and_turn

@@ -7,24 +7,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.by_hand.advice import missing_motion
-from imu_calibration.by_hand.bias_movement import notes
-from imu_calibration.by_hand.calibrate import calibrate_by_hand, with_weak_replaced
-from imu_calibration.by_hand.g_sensitivity import g_sensitivity_evidence, shown
-from imu_calibration.by_hand.model import CROSS_TERMS, UPPER, unpack
-from imu_calibration.by_hand.options import HandOptions, hand_options
-from imu_calibration.by_hand.poses import average_poses
-from imu_calibration.by_hand.turns import at_range_end, rising, sample_times
-from imu_calibration.by_hand.workflow import HandRecording, calibrate_samples_by_hand, read_by_hand
-from imu_calibration.calibration.options import CalibrationOptions
-from imu_calibration.calibration.status import reasons_held
-from imu_calibration.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
-from imu_calibration.errors import InputError
+from imu_calibration.calibration.advice import missing_motion
+from imu_calibration.calibration.hand_workflow import HandRecording, calibrate_samples_by_hand, read_by_hand
+from imu_calibration.core.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.estimation.covariance_terms import of_fit
-from imu_calibration.preflight.checks import Preflight
-from imu_calibration.reference.earth import EARTH_RATE
-from imu_calibration.samples import ImuSamples, SampleBlock, runs_of
-from imu_calibration.segmentation.static_detector import find_still
+from imu_calibration.estimation.status import reasons_held
+from imu_calibration.kinematics.earth import EARTH_RATE
+from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.references.gravity.bias_movement import notes
+from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
+from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand, with_weak_replaced
+from imu_calibration.references.gravity.hand_options import HandOptions, hand_options
+from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, UPPER, unpack
+from imu_calibration.references.gravity.poses import average_poses
+from imu_calibration.references.gravity.turns import at_range_end, rising, sample_times
+from imu_calibration.references.options import CalibrationOptions
 
 from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth
 from worlds.hand_trials import clean, jitter

@@ -9,14 +9,14 @@ from refusal import refused
 from scipy.spatial.transform import Rotation
 from test_by_hand import GRAVITY, load, simulate
 
-from imu_calibration.by_hand.advice import missing_motion
-from imu_calibration.by_hand.live import LiveByHand
-from imu_calibration.by_hand.status import FACES, unseen
-from imu_calibration.by_hand.workflow import calibrate_without_table
-from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.advice import missing_motion
+from imu_calibration.calibration.hand_workflow import calibrate_without_table
+from imu_calibration.calibration.live_poses import LiveByHand
+from imu_calibration.calibration.pose_scan import FACES, unseen
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
-from imu_calibration.errors import DocumentError, InputError, NotObservableError
-from imu_calibration.samples import ImuSamples, SampleBlock
+from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.references.options import CalibrationOptions
 
 from worlds.physics_table import stand_up
 

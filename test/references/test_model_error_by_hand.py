@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.by_hand.calibrate import calibrate_by_hand
-from imu_calibration.by_hand.model import GYRO_MATRIX
-from imu_calibration.by_hand.options import HandOptions
+from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
+from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import GYRO_MATRIX
 
 from worlds.hand_coverage import GROUPS, errors
 from worlds.hand_sessions import GRAVITY, PARAM_NAMES

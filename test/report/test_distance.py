@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from imu_calibration.diagnosis.traces import DistanceSums
+from imu_calibration.calibration.diagnosis.traces import DistanceSums
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.segmentation.window import Window, WindowKind
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.preprocessing.window import Window, WindowKind
 
 NOISE = {sensor: NoiseModel(np.full(3, 0.01**2), np.ones(3)) for sensor in SENSORS}
 

@@ -9,25 +9,25 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from imu_calibration import navigation
-from imu_calibration.by_hand.workflow import calibrate_without_table
-from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.hand_workflow import calibrate_without_table
+from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.units import with_sd
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import restrict
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics import strapdown
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.calibration_page import calibration_report
 from imu_calibration.report.navigation_section import expected_growth, motion_growth, noise_densities
 from imu_calibration.report.numbers import fixed, text
 from imu_calibration.report.readings import reading_tables
 from imu_calibration.report.residuals import autocorrelation
-from imu_calibration.samples import SampleBlock
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
-from imu_calibration.units import with_sd
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
                                        {'name': 'inner', 'axis': [1, 0, 0]}],
@@ -187,7 +187,7 @@ def test_expected_drift_at_rest_is_that_of_simulated_runs(on_table):
     ends = []
     for _ in range(150):
         force, rate = (rng.normal(0, d / np.sqrt(period), (len(time), 3)) for d in densities)
-        run = navigation.strapdown(time, force + [0, 0, 9.81], rate, gravity=9.81)
+        run = strapdown.strapdown(time, force + [0, 0, 9.81], rate, gravity=9.81)
         ends.append([np.linalg.norm(run.velocity_n[-1]), np.linalg.norm(run.position_n[-1])])
     rms = np.sqrt(np.mean(np.square(ends), axis=0))
     assert rms == pytest.approx([parts['noise'].velocity[0, -1], parts['noise'].position[0, -1]], rel=0.2)  # 150 runs: 4 % each

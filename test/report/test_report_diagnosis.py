@@ -9,15 +9,15 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from imu_calibration.beyond.proposals import Proposal
-from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.result import exit_code
-from imu_calibration.diagnosis.workflow import diagnose_recording
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.effects.term import term
-from imu_calibration.reference.table import Table
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.diagnosis_page import cause_of, chance, diagnosis_report, draw_finding, explained_share, variables
-from imu_calibration.samples import SampleBlock
+from imu_calibration.selection.proposals import Proposal
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate

@@ -7,19 +7,19 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from imu_calibration import files
-from imu_calibration.beyond import proposals
-from imu_calibration.beyond.fitting import BlockFits, share_interval, share_removed
-from imu_calibration.beyond.grammar import grammar
-from imu_calibration.beyond.inquiry import Examination, without_superseded
-from imu_calibration.beyond.proposals import propose
-from imu_calibration.beyond.regime_variables import variables_of
-from imu_calibration.beyond.regimes import find_regimes
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
+from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose, told
 from imu_calibration.cli.main import main
-from imu_calibration.diagnosis.diagnose import diagnose, told
-from imu_calibration.diagnosis.workflow import diagnosis_lines
+from imu_calibration.document import files
 from imu_calibration.effects.column_group import ColumnGroup
+from imu_calibration.selection import proposals
+from imu_calibration.selection.grammar import grammar
 from imu_calibration.selection.investigation import investigate
+from imu_calibration.selection.proposals import propose
+from imu_calibration.selection.regime_variables import variables_of
+from imu_calibration.selection.regimes import find_regimes
+from imu_calibration.selection.residual_analysis import Examination, without_superseded
+from imu_calibration.selection.residual_fit import BlockFits, share_interval, share_removed
 
 from worlds import physics
 from worlds.beyond_catalogue import row_of
@@ -177,7 +177,7 @@ def test_a_cause_of_the_table_that_spoils_the_other_sensor_is_no_cause(monkeypat
 def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and_is_diagnosed(tmp_path, capsys):
     session = physics.make_session(5, None, 'white', cause=Beyond('scale_under_load', 5))
     physics.write_bag(session, tmp_path / 'bag')
-    from imu_calibration import documents
+    from imu_calibration.core import documents
     (tmp_path / 'table.yaml').write_text(documents.to_text(session.table))
     table = ['--table', str(tmp_path / 'table.yaml')]
     assert main(['diagnose', str(tmp_path / 'bag'), *table, '--output', str(tmp_path / 'out')]) in (0, 3)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from imu_calibration.diagnosis.diagnose import told
-from imu_calibration.diagnosis.workflow import diagnosis_lines
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
+from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.effects.base import Role
 from imu_calibration.selection import investigation
 from imu_calibration.selection.investigation import investigate

@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.beyond import regimes
-from imu_calibration.beyond.blocks import RestBlocks
-from imu_calibration.beyond.fitting import BlockFits
-from imu_calibration.beyond.regime_variables import Variable, ranged
 from imu_calibration.estimation.noise_model import BiasProcess
+from imu_calibration.selection import regimes
+from imu_calibration.selection.regime_variables import Variable, ranged
+from imu_calibration.selection.residual_blocks import RestBlocks
+from imu_calibration.selection.residual_fit import BlockFits
 
 WINDOWS, EACH = 60, 4
 TIME = np.arange(WINDOWS * EACH, dtype=float)

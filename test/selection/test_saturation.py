@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window import Window
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.selection import investigation, saturation
 from imu_calibration.selection.saturation import find_saturation, may_be_clipped, without_clipped
 from imu_calibration.use_cases.diagnose import diagnose

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.beyond import unexplained as rests
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
 from imu_calibration.estimation.noise_search import FLICKER, NoiseLikelihood
 from imu_calibration.selection import gain, investigation
+from imu_calibration.selection import unexplained as rests
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.bias_process_search import BiasProcessSearch
 from imu_calibration.selection.evidence import Evidence, WindowEvidence, folds_of, locked_windows

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from imu_calibration.beyond import unexplained
+from imu_calibration.selection import unexplained
 
 
 def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monkeypatch):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from imu_calibration.beyond.spectrum import find_tones, of_stretches
 from imu_calibration.report.spectrum_figure import draw_tones
 from imu_calibration.selection.investigation import investigate
+from imu_calibration.selection.spectrum import find_tones, of_stretches
 
 from worlds.hiding import record
 from worlds.physics_beyond import Machine

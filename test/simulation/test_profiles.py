@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.errors import InputError
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.table import Table
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.motion_primitives import REGISTRY, avrutov_rates_deg
 from imu_calibration.simulation.profiles import make_profile, profile_names

@@ -13,11 +13,11 @@ import yaml
 from refusal import refused
 
 import imu_calibration as imu
-from imu_calibration import files
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.stream import CompensationStream
-from imu_calibration.errors import DocumentError, InputError
-from imu_calibration.samples import ImuSamples, SampleBlock, TemperatureSamples
+from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
+from imu_calibration.document import files
 from msg_adapters.bag import open_recording
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imu_calibration import documents
-from imu_calibration.calibration.document_text import calibration_from_text
 from imu_calibration.cli.main import main
+from imu_calibration.core import documents
+from imu_calibration.document.calibration_text import calibration_from_text
 
 BAG = Path(__file__).parents[2] / 'bags' / 'sample_session'
 
@@ -60,7 +60,7 @@ def test_compare_with_the_truth(output, capsys):
 def test_compensated_bag(output, tmp_path):
     """The corrected topic stands beside the others and is closer to the reference."""
     from imu_calibration.compensation.evaluation import before_and_after, session_truth
-    from imu_calibration.reference.table import Table
+    from imu_calibration.kinematics.table import Table
     from msg_adapters.bag import open_recording
     corrected = tmp_path / 'corrected'
     assert main(['compensate', str(BAG), '--calibration', str(output / 'calibration.yaml'), '--output', str(corrected)]) == 0

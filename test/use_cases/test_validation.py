@@ -48,7 +48,7 @@ def test_a_turn_left_out_is_used_by_no_peer():
 
 
 def test_a_pose_left_out_leaves_nothing_behind():
-    from imu_calibration.samples import ImuSamples
+    from imu_calibration.core.samples import ImuSamples
     values = np.arange(60.0).reshape(20, 3)
     imu = ImuSamples(10**9 + 10**7 * np.arange(20), values, values)
     rest, ranges = held_out.without(imu, [slice(2, 5), slice(8, 12), slice(15, 20)], [1])

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.coverage import line_of
-from imu_calibration.calibration.document import UNKNOWN
-from imu_calibration.calibration.document_text import calibration_to_text
 from imu_calibration.calibration.residual_spectrum import residual_spectrum
 from imu_calibration.cli.main import main
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document.calibration import UNKNOWN
+from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.samples import SampleBlock
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.diagnose import diagnose
 from imu_calibration.use_cases.foxglove_file import PARAMETERS, RESIDUAL, SCHEMAS, SPECTRUM, SPHERE, _from_x, scene_of

@@ -15,13 +15,13 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.constants import STANDARD_GRAVITY
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.reference.kinematics import reference_motion
-from imu_calibration.reference.perturbed_table import tilt, with_axis_angles, with_axis_places
-from imu_calibration.reference.table import Table
-from imu_calibration.reference.urdf import table_from_urdf
-from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock
+from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.perturbed_table import tilt, with_axis_angles, with_axis_places
+from imu_calibration.kinematics.table import Table
+from imu_calibration.kinematics.urdf import table_from_urdf
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES, add_imu_noise, read_encoders, realistic
 
@@ -184,7 +184,7 @@ def truth(world):
 
 def deviations(world):
     """Return {parameter: error in standard deviations} of a calibration of the world, and the calibration."""
-    from imu_calibration.calibration.calibrate import calibrate
+    from imu_calibration.calibration.table_calibration import calibrate
     calibration = calibrate([lambda: iter([world.block])], world.table).calibration
     found = dict(zip(calibration.param_names, zip(calibration.values, calibration.sd, strict=True), strict=True))
     return {name: (found[name][0] - value) / found[name][1] for name, value in truth(world).items()}, calibration

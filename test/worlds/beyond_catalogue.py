@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.beyond.unexplained import biases_off
+from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
 from imu_calibration.calibration.model_changes import Demand
-from imu_calibration.diagnosis.diagnose import diagnose
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.references.turntable.extended_model import extended_solution
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.extended_model import extended_solution
+from imu_calibration.selection.unexplained import biases_off
 
 from worlds.hiding import record
 from worlds.physics_beyond import Beyond

@@ -1,6 +1,6 @@
 """A whole stream cleaned at once."""
 
-from imu_calibration.segmentation.stream_cleaning import StreamCheck
+from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 
 
 def clean_samples(samples, gap=0.1):

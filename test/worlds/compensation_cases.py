@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.calibration.document import Calibration
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 

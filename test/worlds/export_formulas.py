@@ -1,7 +1,7 @@
 """
 What other programs make of an exported file: their formulas and their file formats, written from their sources, one function for each.
 
-Nothing of `imu_calibration.exports` is used here. Each function takes the text of a file and one sample and returns what stands in its
+Nothing of `imu_calibration.document.exports` is used here. Each function takes the text of a file and one sample and returns what stands in its
 docstring. Sources are named by project and file.
 """
 

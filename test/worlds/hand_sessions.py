@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.by_hand.model import HandModel, unpack
+from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.samples import ImuSamples
+from imu_calibration.references.gravity.hand_parameters import HandModel, unpack
 
 GRAVITY = 9.81
 FULL = HandModel(SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity')), GRAVITY)

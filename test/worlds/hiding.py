@@ -11,8 +11,8 @@ from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.selection.evidence import FOLDS
 from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.search import FAMILY_WISE, LEAST_GAIN, PENALTY, least_angle

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from imu_calibration import documents
-from imu_calibration.calibration.calibrate import calibrate
-from imu_calibration.calibration.options import CalibrationOptions
+from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.core import documents
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.reference.table import Table
-from imu_calibration.samples import SampleBlock
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.calibration.linearisation import PASSES, linearise_again
-from imu_calibration.calibration.options import CalibrationOptions, choose_model
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.covariance_terms import HELD, of_fit
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
-from imu_calibration.reference.table import Table
-from imu_calibration.segmentation.window_finder import MotionGatherer
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window_finder import MotionGatherer
+from imu_calibration.references.options import CalibrationOptions, choose_model
+from imu_calibration.selection.linearisation import PASSES, linearise_again
 
 from worlds.misfit_worlds import CAUSES, make_pair
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.signal import cont2discrete, lfilter
 
-from imu_calibration.reference.joint_motion import JointMotion
+from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 
 from worlds.physics import Session, make_session

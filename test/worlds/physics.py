@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.reference.joint_motion import JointMotion
-from imu_calibration.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_imu_noise, jitter_stamps, read_encoders, realistic
 

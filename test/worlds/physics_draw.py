@@ -4,7 +4,7 @@ from zlib import crc32
 
 import numpy as np
 
-from imu_calibration.samples import TemperatureSamples
+from imu_calibration.core.samples import TemperatureSamples
 
 from worlds.physics_sensor import Triad
 

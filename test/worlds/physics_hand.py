@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.by_hand.model import unpack
-from imu_calibration.samples import ImuSamples
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.references.gravity.hand_parameters import unpack
 
 from worlds.hand_sessions import GRAVITY, NOMINAL, SENSITIVITY, random_truth, turn_samples
 

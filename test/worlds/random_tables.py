@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from imu_calibration.constants import DEG
-from imu_calibration.reference.joint import Joint, JointLimits
-from imu_calibration.reference.table import Table
+from imu_calibration.core.constants import DEG
+from imu_calibration.kinematics.joint import Joint, JointLimits
+from imu_calibration.kinematics.table import Table
 
 
 def random_axes(rng, count):

@@ -3,9 +3,9 @@
 import numpy as np
 import yaml
 
-from imu_calibration.calibration.document_text import calibration_to_text
-from imu_calibration.documents import to_text
-from imu_calibration.samples import ImuSamples, JointSamples
+from imu_calibration.core.documents import to_text
+from imu_calibration.core.samples import ImuSamples, JointSamples
+from imu_calibration.document.calibration_text import calibration_to_text
 from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration

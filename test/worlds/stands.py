@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from imu_calibration.calibration.options import CalibrationOptions, choose_model
-from imu_calibration.reference.table import Table
-from imu_calibration.reference.urdf import table_from_urdf
+from imu_calibration.kinematics.table import Table
+from imu_calibration.kinematics.urdf import table_from_urdf
+from imu_calibration.references.options import CalibrationOptions, choose_model
 
 from worlds.arms import GANTRY, SEVEN_AXES, SIX_AXES
 from worlds.random_tables import random_table

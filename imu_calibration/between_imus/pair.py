@@ -1,0 +1,171 @@
+"""Two IMUs on one rigid body: readings calibrated by hand, and rotation and time offset of B relative to A."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.core.errors import InputError, NotObservableError
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.settings import setting
+from imu_calibration.kinematics.modulating_functions import SAMPLES_LEAST, holes, make_windows
+from imu_calibration.kinematics.reference_motion import skew
+from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.references.gravity.equations import Poses
+from imu_calibration.references.gravity.hand_calibration import HandCalibration, calibrate_by_hand
+from imu_calibration.references.gravity.hand_options import HandOptions
+
+
+@dataclass(frozen=True)
+class ArmSettings:
+    """Numbers for the estimate of a relative arm."""
+
+    window: float = setting(0.12, 's', 'length of the windows over which the motion is integrated; never below eight samples', (0.004, 5.0),
+                            'too short: noise of the angular acceleration shortens the arm; too long: fast motion averages out')
+    motion_share: float = setting(0.05, '1', 'windows with less lever-arm acceleration than this share of the strongest are left out',
+                                  (0.0, 0.9), 'too small: resting windows rule the noise estimate')
+    cluster: float = setting(2.0, 's', 'errors are independent between segments of this length', (0.1, 100.0),
+                             'too small: sd too small')
+    gap: float = setting(0.1, 's', 'windows do not bridge longer holes; never below five periods', (0.001, 60.0), '')
+
+
+@dataclass(frozen=True, eq=False)
+class PairedImu:
+    """One IMU of the pair, compensated."""
+
+    time: np.ndarray
+    """Seconds since A's first sample on its own clock, shape (n,)."""
+    force: np.ndarray
+    """Specific force, own frame, m/s^2, shape (n, 3)."""
+    rate: np.ndarray
+    """Angular rate, own frame, rad/s, shape (n, 3)."""
+    flagged: np.ndarray
+    """Samples at the end of the range or next to a hole, shape (n,)."""
+    calibration: HandCalibration | None
+    """Calibration applied; None: only the rates' bias at rest was removed."""
+    poses: Poses | None
+    """Poses of a calibration from the same recording."""
+    period: float
+    """Median step, s."""
+
+    @classmethod
+    def make(cls, imu: ImuSamples, start_ns: int, gravity: float, *, calibration: HandCalibration | None,
+             settings: ArmSettings) -> 'PairedImu':
+        """Compensate the samples of one IMU, with a calibration from their own poses when none is given."""
+        time = 1e-9 * (imu.stamp_ns - start_ns)
+        keep = np.concatenate([[True], np.diff(time) > 0])  # repeated stamps add no new time
+        imu, time = imu.select(keep), time[keep]
+        period = float(np.median(np.diff(time)))
+        made_here = calibration is None
+        calibration = _calibrate(imu, gravity) if made_here else calibration
+        flagged = clipped(imu.force_s) | clipped(imu.rate_s) | holes(time, max(settings.gap, 5 * period))
+        poses = calibration.poses if made_here and calibration is not None else None
+        force, rate = _compensated(imu, calibration)
+        return cls(time, force, rate, flagged, calibration, poses, period)
+
+
+def clipped(values: np.ndarray) -> np.ndarray:
+    """
+    Return which samples are at the end of the range, shape (n,).
+
+    The end of the range is a largest reading of one sign, over all axes, that occurs repeatedly; a largest reading
+    that occurs at most twice is due to the motion. The two ends may differ by one count.
+    """
+    flagged = np.zeros(len(values), bool)
+    for signed in (values, -values):
+        at_end = signed >= signed.max() - 1e-9 * np.abs(signed).max()
+        if np.sum(at_end) > 2:
+            flagged |= np.any(at_end, axis=1)
+    return flagged
+
+
+def _calibrate(imu, gravity):
+    try:
+        return calibrate_by_hand(imu, HandOptions(gravity), find_still(imu))
+    except NotObservableError:
+        return None
+
+
+def _compensated(imu, calibration):
+    if calibration is not None:
+        return calibration.compensate(imu.force_s, imu.rate_s)
+    still = find_still(imu)
+    bias = np.mean([imu.rate_s[s].mean(0) for s in still], axis=0) if still else np.zeros(3)
+    return imu.force_s, imu.rate_s - bias
+
+
+def require_overlap(imu_a: ImuSamples, imu_b: ImuSamples) -> None:
+    """Refuse IMUs that were not recorded at the same time."""
+    if len(imu_a) < 2 * SAMPLES_LEAST or len(imu_b) < 2 * SAMPLES_LEAST:
+        raise InputError(f'both IMUs must have at least {2 * SAMPLES_LEAST} samples, got {len(imu_a)} and {len(imu_b)}; check the topics',
+                         code='too_few_samples')
+    overlap = min(imu_a.stamp_ns[-1], imu_b.stamp_ns[-1]) - max(imu_a.stamp_ns[0], imu_b.stamp_ns[0])
+    if overlap <= 0:
+        raise InputError(f'the two IMUs must have been recorded at the same time, their stamps differ by {-1e-9 * overlap:.1f} s; '
+                         'check the clocks', code='no_overlap')
+
+
+def window_length(a: PairedImu, b: PairedImu, settings: ArmSettings) -> float:
+    """Return the length of the windows, s."""
+    return max(settings.window, SAMPLES_LEAST * max(a.period, b.period))
+
+
+def window_centres(a: PairedImu, b: PairedImu, *, offset: float, length: float) -> np.ndarray:
+    """Return the middles of the windows, s on A's clock: on A's samples where these are even."""
+    step, margin = max(a.period, length / SAMPLES_LEAST), 0.51 * length + 0.1
+    begin = max(a.time[0], b.time[0] - offset) + margin
+    end = min(a.time[-1], b.time[-1] - offset) - margin
+    if end - begin < step:
+        raise InputError(f'the two IMUs must overlap by more than {2 * margin:.1f} s, got {end - begin + 2 * margin:.1f} s; record longer')
+    first = a.time[np.searchsorted(a.time, begin)]
+    return first + step * np.arange(int((end - first) / step) + 1)
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeRotation:
+    """Rotation and time offset of B relative to A."""
+
+    mat_ab: np.ndarray
+    """Rotation, B's frame to A's, shape (3, 3)."""
+    cov: np.ndarray
+    """Covariance of its error as a rotation vector, rad^2, shape (3, 3)."""
+    offset: float
+    """Delay of B's stamps, s."""
+
+
+def relative_rotation(a: PairedImu, b: PairedImu, settings: ArmSettings, *, rounds: int = 4) -> RelativeRotation:
+    """Return the rotation from the directions at rest if both were calibrated, otherwise from the rates; the offset from the rates."""
+    offset, length = 0.0, window_length(a, b, settings)
+    for _ in range(rounds):
+        centres = window_centres(a, b, offset=offset, length=length)
+        over_a, over_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
+        free = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
+        over_a, over_b = over_a.select(free), over_b.select(free)
+        rate_a, rate_b, alpha = over_a.mean(a.rate), over_b.mean(b.rate), over_a.slope(a.rate)
+        mat_ab = _align(rate_a, rate_b)
+        offset -= float(np.sum((rate_b @ mat_ab.T - rate_a) * alpha) / max(np.sum(alpha * alpha), 1e-300))
+    at_rest = _directions_at_rest(a, b, offset)
+    pairs, overlap = ((rate_a, rate_b), SAMPLES_LEAST) if at_rest is None else (at_rest, 1)
+    mat_ab = _align(*pairs)
+    residual = pairs[0] - pairs[1] @ mat_ab.T
+    cross = skew(pairs[0])
+    information = np.einsum('nki,nkj->ij', cross, cross) + 1e-12 * np.eye(3)
+    return RelativeRotation(mat_ab, overlap * np.mean(residual**2) * np.linalg.inv(information), offset)
+
+
+def _align(vectors_a, vectors_b):
+    """Return the rotation closest to ``vectors_a = mat_ab @ vectors_b`` (Kabsch)."""
+    left, _, right = np.linalg.svd(vectors_a.T @ vectors_b)
+    return left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+
+
+def _directions_at_rest(a, b, offset):
+    """Return mean forces of both over the times when both rest, or None when there are too few directions."""
+    if a.poses is None or b.calibration is None:
+        return None
+    pairs = []
+    for first, last in zip(a.poses.start, a.poses.stop):
+        begin, end = a.time[first], a.time[last - 1]
+        in_b = slice(*np.searchsorted(b.time, (begin + offset, end + offset)))
+        if in_b.stop - in_b.start >= 2:
+            pairs.append((a.force[first:last].mean(0), b.force[in_b].mean(0)))
+    return tuple(np.array(pairs).swapaxes(0, 1)) if len(pairs) >= 4 else None

@@ -1,0 +1,199 @@
+"""
+Next attitude by hand: the planner for plan, terminal, status, picture and the motions that a calibration requests.
+
+The gain of a step is the decrease of the excess (logarithms of standard deviations over tolerances), its cost the duration in seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.calibration.coverage import DIRECTIONS, excess, share_gained
+from imu_calibration.calibration.hand_step import TURNED, HandStep, steps_from, turn_rows
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.status import LACKING
+from imu_calibration.references.gravity.equations import Poses
+from imu_calibration.references.gravity.hand_calibration import HandCalibration
+from imu_calibration.references.gravity.hand_options import ByHandSettings
+from imu_calibration.references.gravity.hand_parameters import GYRO_BIAS, GYRO_MATRIX, HandModel, unpack
+
+TREMBLING, CREEPING = 1.5e-3, 5e-4
+"""m/s^2, rad/s (0.03 deg/s); expected sd of the means of a pose from noise, trembling and creeping hands, before it is estimated."""
+MARGIN = 0.85
+"""Share of the tolerance as goal: the scatter of some twenty poses and turns, a part of every standard deviation, is known to a sixth."""
+MOST_STEPS = 60
+LEAST_GAIN = 1e-3
+"""Poses with a smaller relative gain are not planned; other information is required, such as the gravity."""
+WEIGHTS = (0.0, 1.0)
+"""Exponents of the seconds of a step in its choice: `foretold` tries both."""
+SERVES = 0.5
+"""Share of the best gain per second for one sensor from which the next step of the common plan is recommended for it too."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandKnowledge:
+    """Current information of a session by hand, and the expected information of one more pose."""
+
+    model: HandModel
+    """The parameters."""
+    values: np.ndarray
+    """Their values, or the nominal ones, shape (n,)."""
+    information: np.ndarray
+    """Of the data so far, shape (n, n)."""
+    tolerances: np.ndarray
+    """Goal, shape (n,)."""
+    pose_sd: float
+    """Expected sd of one pose, m/s^2."""
+    drift_sd: float
+    """The same for the bias of the gyroscope, rad/s."""
+    turn_sd: float
+    """The same for a turn, rad."""
+    up: np.ndarray | None
+    """Current vertical in the sensor frame, shape (3,); None: unknown."""
+
+    def after(self, ups: np.ndarray, turns: np.ndarray) -> np.ndarray:
+        """Return the information after a turn to each of several directions, with these `turn_rows` (k, 2, 9), and a rest."""
+        bias, matrix, *_ = unpack(self.values)
+        forces = bias + self.model.gravity * ups @ matrix.T
+        # temperature and time at the reference point: one more pose there has no information about thermal effects
+        count = len(ups)
+        warmth = np.full(count, self.model.model.temperature_ref_c)
+        norms = self.model.norm_rows(self.values, forces, time=np.zeros(count), temperature_c=warmth)[1]
+        rows = self.rows(norms, turns)
+        return self.information + np.einsum('kri,krj->kij', rows, rows)
+
+    def rows(self, norms: np.ndarray, turns: np.ndarray) -> np.ndarray:
+        """Return the design of poses in sd, shape (k, 6, n): from lengths of gravity (k, n), rates at rest, turns (k, 2, 9)."""
+        rows = np.zeros((len(norms), 6, self.model.size))
+        rows[:, 0] = norms / self.pose_sd
+        rows[:, 1:4, GYRO_BIAS] = np.eye(3) / self.drift_sd
+        rows[:, 4:6, GYRO_MATRIX] = turns / self.turn_sd
+        return rows
+
+    def sd(self, information: np.ndarray) -> np.ndarray:
+        """Return the standard deviations with some information; leading axes are kept."""
+        inverse = np.linalg.inv(information + np.diag(1 / self.model.priors**2))
+        return np.sqrt(np.diagonal(inverse, axis1=-2, axis2=-1))
+
+    def missing(self, information: np.ndarray, only: Sequence[int] | slice = slice(None)) -> np.ndarray:
+        """Return the remaining `excess` of all or some parameters given some information; leading axes are kept."""
+        return excess(self.sd(information)[..., only], self.tolerances[only])
+
+    def best(self, only: Sequence[int] | slice = slice(None), *, weight: float = 1.0) -> tuple[HandStep, np.ndarray, np.ndarray]:
+        """
+        Return (the step with the largest gain per second, relative gain of each of `DIRECTIONS`, information after the step).
+
+        only : sequence of int, optional
+            Parameters for which the gain is computed; by default all.
+        weight : float
+            Exponent of the seconds; 0: they do not count.
+
+        """
+        steps, turns = steps_from(self.up)
+        information = self.after(DIRECTIONS, turns)
+        worth = share_gained(float(self.missing(self.information, only)), self.missing(information, only))
+        if self.up is not None:
+            worth[DIRECTIONS @ self.up > np.cos(TURNED)] = 0.0   # the current attitude
+        place = int(np.argmax(worth / np.array([step.seconds for step in steps])**weight))
+        return steps[place], worth, information[place]
+
+    def then(self, step: HandStep) -> HandKnowledge:
+        """Return the knowledge after a step."""
+        return replace(self, information=self.after(step.up[None], turn_rows(self.up, step.up)[None])[0], up=step.up)
+
+
+def foretold(knowledge: HandKnowledge) -> list[HandStep]:
+    """
+    Return the steps still needed: the shorter of the plans with and without the seconds of each step in its choice.
+
+    The largest gain per second is not always the shortest plan: it begins with small turns, after which more remains to be done.
+    """
+    plans = [_rollout(knowledge, weight) for weight in WEIGHTS]
+    return min(plans, key=lambda plan: (plan[1], sum(step.seconds for step in plan[0])))[0]
+
+
+def _rollout(knowledge, weight):
+    """Return (the steps by greedy choice, the remaining excess)."""
+    steps: list[HandStep] = []
+    while float(knowledge.missing(knowledge.information)) > 0 and len(steps) < MOST_STEPS:
+        step, worth, _ = knowledge.best(weight=weight)
+        if worth.max() < LEAST_GAIN:
+            break
+        steps.append(step)
+        knowledge = knowledge.then(step)
+    return steps, round(float(knowledge.missing(knowledge.information)), 9)
+
+
+def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
+    """
+    Return {'parameters': {name: sd over tolerance}, 'needs': the step that helps most} for each sensor that is not fully determined.
+
+    Recommended is the next step of the common plan, shown in the picture, if it serves the sensor; otherwise the best step for the sensor.
+    """
+    knowledge, lacking = knowledge_after(hand), {}
+    for name, status, sd, tolerance in zip(hand.param_names, hand.statuses, hand.own_sd, hand.tolerances, strict=True):
+        if status in LACKING:
+            lacking.setdefault(name.split('.')[0], {})[name] = float(sd / tolerance)
+    parts = {sensor: [hand.model.param_names.index(name) for name in lacking[sensor]] for sensor in SENSORS if sensor in lacking}
+    plan = foretold(knowledge)[:1] if parts else []
+
+    def gain(part, step):
+        after = knowledge.then(step).information
+        return float(knowledge.missing(knowledge.information, part) - knowledge.missing(after, part)) / step.seconds
+    found = []
+    for sensor, part in parts.items():
+        own = knowledge.best(part)[0]
+        best = next((step for step in plan if gain(part, step) >= SERVES * gain(part, own)), own)
+        found.append({'parameters': lacking[sensor], 'needs': best.words})
+    return tuple(found)
+
+
+def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHandSettings, *,
+                       noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+                       poses: Poses | None = None) -> HandKnowledge:
+    """
+    Return the HandKnowledge before the first solution: from the poses only, at nominal values and with the scatter of the settings.
+
+    Parameters
+    ----------
+    model : HandModel
+    tolerances : ndarray, shape (n,)
+    settings : ByHandSettings
+    noise : tuple
+        Contribution of the sensor noise to a pose (m/s^2), to its mean rate (rad/s) and to a turn (rad).
+    poses : Poses, optional
+        Poses so far.
+
+    """
+    scatter = (np.hypot(settings.pose_scatter, TREMBLING), np.hypot(settings.drift_scatter, CREEPING), settings.turn_scatter)
+    pose_sd, drift_sd, turn_sd = (float(np.hypot(*pair)) for pair in zip(scatter, noise, strict=True))
+    knowledge = HandKnowledge(model, model.nominal, np.zeros((model.size, model.size)), MARGIN * tolerances, pose_sd, drift_sd, turn_sd,
+                              None)
+    if poses is None:
+        return knowledge
+    ups = ups_of(poses)
+    turns = np.array([turn_rows(start, end) for start, end in zip([None, *ups[:-1]], ups, strict=True)])   # no turn before the first pose
+    rows = knowledge.rows(model.norm_rows(model.nominal, poses.force)[1], turns)
+    return replace(knowledge, information=np.einsum('kri,krj->ij', rows, rows), up=ups[-1])
+
+
+def knowledge_after(hand: HandCalibration) -> HandKnowledge:
+    """Return the HandKnowledge of a solution: its information, reduced by the growth of its standard deviations beyond noise."""
+    model, statistics, poses = hand.model, hand.statistics, hand.poses
+    published = [hand.param_names.index(name) for name in model.param_names]
+    expected = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
+    known = expected < 0.5 * model.priors
+    wider = max(1.0, float(np.max(np.where(known, hand.own_sd[published] / expected, 0.0))))
+    pose_sd = np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd'])
+    drift_sd = np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd'])
+    turn_sd = max(statistics['turn_scatter_sd'], 1e-4)
+    return HandKnowledge(model, hand.state.values, hand.information / wider**2, MARGIN * hand.tolerances[published],
+                         float(wider * pose_sd), float(wider * drift_sd), float(wider * turn_sd), ups_of(poses)[-1])
+
+
+def ups_of(poses: Poses | None) -> np.ndarray:
+    """Return the directions that were up, unit vectors, shape (k, 3)."""
+    return np.zeros((0, 3)) if poses is None else poses.force / np.linalg.norm(poses.force, axis=1, keepdims=True)

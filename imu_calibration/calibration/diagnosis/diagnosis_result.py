@@ -1,0 +1,194 @@
+"""Result of a diagnosis: findings, candidates, solutions, residuals."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS, UNIT
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.selection.gain import Gain
+from imu_calibration.selection.unexplained import Unexplained
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One effect that is missing in the model."""
+
+    effect: str
+    """Published name."""
+    sensor: str
+    """'accelerometer', 'gyroscope' or 'reference'."""
+    explanation: str
+    """One sentence for a test engineer, with the size."""
+    parameters: dict
+    """Parameter name -> (value, sd, unit), SI, from all windows."""
+    p_value: float
+    """Probability of such a decrease of the misfit from noise, times the number of effects under test."""
+    heldout_gain: float
+    """Gain of log likelihood on held-out windows, nats."""
+    share: float
+    """Share of the unexplained residual that it removes from held-out windows."""
+    gain: Gain
+    """`gain.Gain` on windows held out from the choice, of this finding in addition to the earlier ones."""
+    indistinguishable_from: tuple
+    """Effects that are collinear with it in this recording, at most two."""
+    separating_motion: str
+    """Motion that separates them; empty without such an effect."""
+    against: tuple = ()
+    """Variables of its residual plot, as in ``Effect.against``."""
+    sizes_of_mates: dict = field(default_factory=dict)
+    """
+    Each of `indistinguishable_from` -> parameter name -> (value, unit), SI: its estimate in the place of the finding.
+    """
+    implausible: bool = False
+    """Whether its size exceeds the known range of such sensors; it is then in no model."""
+
+    @property
+    def title(self) -> str:
+        """Its name, with the mark where its size is implausible."""
+        return self.effect + ' (implausible)' * self.implausible
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One effect under test."""
+
+    effect: str
+    """Published name."""
+    sensor: str
+    """'accelerometer', 'gyroscope' or 'reference'."""
+    gain_alone: float
+    """Held-out gain of log likelihood in addition to the baseline, nats."""
+    p_value_alone: float
+    """Its p-value there, times the number of effects under test."""
+    gain_beside: float | None
+    """The same in addition to the findings; None for a finding."""
+    p_value_beside: float | None
+    """Its p-value there."""
+    verdict: str
+    """``found``, ``as good as NAME``, ``not needed beside the findings``, ``no evidence``, or the reason of a refusal."""
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """Result of a diagnosis for reports, documents and nodes."""
+
+    findings: tuple
+    """Findings in order of strength."""
+    unexplained: dict
+    """Sensor -> `unexplained.Unexplained`, in addition to the findings."""
+    candidates: tuple
+    """Every effect under test (Candidate), in order of strength."""
+    not_testable: tuple
+    """{'effect', 'why', 'needs'} of the effects without a test."""
+    baseline: Solution
+    """Solution of the baseline model."""
+    solution: Any
+    """Solution of the extended model on all windows; the baseline's without findings."""
+    gain: Gain | None
+    """`gain.Gain` of all findings together on windows held out from the choice; None by hand without findings."""
+    windows: int
+    """Windows used."""
+    locked: int
+    """Windows held out from the choice of effects."""
+    traces: Any = None
+    """`traces.Traces`: residuals before and after, for plots; None during a live session."""
+    onset: Any = None
+    """Parameters that change at one moment (`selection.onset.Onset`), or None; the findings are those of the longer part."""
+
+    @property
+    def model(self) -> SensorModel:
+        """The extended SensorModel, linearised at the solution."""
+        return self.solution.model.at(self.solution.values)
+
+
+def formula_gain(rest: Unexplained, windows: int = 0) -> Gain:
+    """
+    Return the gain of the formula that is proposed for an unexplained residual, in the unit of the sensor.
+
+    ``after = before sqrt(1 - share)`` with `before` the rms of the residual beyond noise and `share` the part of its power that the
+    formula removes from the held-out windows, `windows` in number; the interval is that of the share.
+    """
+    low, high = (float(1.0 - np.sqrt(np.clip(1.0 - share, 0.0, None))) for share in rest.proposal.ci95)
+    after = rest.rms * (1.0 - rest.proposal.reduction)
+    return Gain(rest.proposal.sensor, 'rms beyond noise', rest.rms, after, (low, high), windows)
+
+
+def parameters_of(solution: Solution, sensor: str, effect: str) -> dict[str, tuple[float, float, str]]:
+    """Return parameter name -> (value, sd, unit) of one effect."""
+    declared = next(e for e in solution.model.effects if (e.sensor, e.name) == (sensor, effect))
+    part = solution.model.slices[sensor, effect]
+    sd = np.sqrt(np.maximum(np.diag(solution.covariance)[part], 0.0))
+    return {name: (float(value), float(spread), declared.unit_of(k))
+            for k, (name, value, spread) in enumerate(zip(declared.param_names(), solution.values[part], sd))}
+
+
+FORMAT = 'imu_calibration/diagnosis/1'
+
+
+def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return the content of diagnosis.json: plain dicts, lists, strings and numbers, None for NaN and infinity."""
+    return _plain({
+        'format': FORMAT,
+        'baseline': {sensor: _baseline(diagnosis.baseline, sensor) for sensor in SENSORS},
+        'onset': None if diagnosis.onset is None else diagnosis.onset.to_mapping(),
+        'findings': [_finding(finding) for finding in diagnosis.findings],
+        'gain': _gain(diagnosis.gain) if diagnosis.findings else None,
+        'dead_reckoning': diagnosis.traces.dead_reckoning,
+        'simulation_distance': {sensor: each.to_mapping() for sensor, each in diagnosis.traces.distances.items()},
+        'unexplained': {sensor: _rest(sensor, diagnosis.unexplained[sensor], diagnosis.locked) for sensor in SENSORS},
+        'not_testable': list(diagnosis.not_testable),
+        'candidates': [_candidate(candidate) for candidate in diagnosis.candidates],
+        'windows': {'used': diagnosis.windows, 'held_out_for_the_gain': diagnosis.locked}})
+
+
+def _candidate(candidate):
+    beside = {'heldout_log_likelihood_gain': candidate.gain_beside, 'p_value': candidate.p_value_beside}
+    return {'effect': candidate.effect, 'sensor': candidate.sensor, 'verdict': candidate.verdict,
+            'heldout_log_likelihood_gain': candidate.gain_alone, 'p_value': candidate.p_value_alone, 'beside_findings': beside}
+
+
+def _baseline(solution, sensor):
+    model = solution.model
+    return {'effects': list(getattr(model, sensor)), 'reference_effects': list(model.reference),
+            'residual_rms': solution.residual_rms[sensor][0], 'window_mean_rms': solution.residual_rms[sensor][1],
+            'noise_rms': np.sqrt(np.mean(solution.noise[sensor].white_variance))}
+
+
+def _finding(finding):
+    return {'effect': finding.effect, 'sensor': finding.sensor, 'explanation': finding.explanation,
+            'parameters': {name: {'value': value, 'sd': sd, 'unit': unit} for name, (value, sd, unit) in finding.parameters.items()},
+            'p_value': finding.p_value, 'heldout_log_likelihood_gain': finding.heldout_gain, 'share_of_unexplained': finding.share,
+            'gain': _gain(finding.gain), 'indistinguishable_from': list(finding.indistinguishable_from),
+            'sizes_of_mates': {mate: {name: {'value': value, 'unit': unit} for name, (value, unit) in sizes.items()}
+                               for mate, sizes in finding.sizes_of_mates.items()},
+            'separating_motion': finding.separating_motion, 'implausible': finding.implausible}
+
+
+def _gain(gain):
+    return {'sensor': gain.sensor, 'measure': gain.measure, 'heldout_rms_before': gain.heldout_rms_before,
+            'heldout_rms_after': gain.heldout_rms_after, 'reduction': gain.reduction, 'ci95': list(gain.ci95), 'windows': gain.windows}
+
+
+def _rest(sensor, rest, locked):
+    unit = rest.unit or UNIT[sensor]
+    return {'significant': rest.significant, 'rms': rest.rms, 'unit': unit, 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
+            'share': rest.share, 'where': rest.where, 'axes': list(rest.axes), 'regimes': [regime.to_mapping() for regime in rest.regimes],
+            'tones': [tone.to_mapping() for tone in rest.tones],
+            'proposals': [] if rest.proposal is None else [rest.proposal.to_mapping() | {'gain': _gain(formula_gain(rest, locked))}]}
+
+
+def _plain(value):
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value

@@ -1,0 +1,255 @@
+"""Diagnosis as plain functions, on a table and by hand, and its result as lines of text."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
+from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, formula_gain, to_mapping
+from imu_calibration.calibration.diagnosis.hand_diagnosis import told_by_hand
+from imu_calibration.calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST
+from imu_calibration.calibration.diagnosis.table_diagnosis import told
+from imu_calibration.calibration.diagnosis.traces import residual_traces
+from imu_calibration.calibration.hand_workflow import evident_result, read_by_hand
+from imu_calibration.calibration.model_changes import Demand
+from imu_calibration.calibration.table_calibration import conclude, solve_recordings
+from imu_calibration.core.units import error_text
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.verdict_notes import unsteady
+from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
+from imu_calibration.effects.lags import total_lags
+from imu_calibration.effects.sensor_model import BARE
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.references.gravity.model_selection import too_few_poses
+from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.selection.investigation import too_few_windows
+from imu_calibration.selection.onset import Onset
+from imu_calibration.selection.unexplained import Unexplained, biases_off
+
+MOST_SHOWN = 3
+"""Parameters of a change that are printed."""
+MUCH = 100.0
+"""Held-out gain of log likelihood from which a refused effect is reported, nats."""
+WHY_NOT = {LEAVES_MOST: 'most of the unexplained residual remains with it, so that both may have another cause',
+           DISAGREED: 'the windows do not agree on it: the evidence comes from few windows, or some contradict it; '
+           'record more windows of the same motions'}
+"""Verdict on an effect with a large gain -> reason why it is no finding."""
+
+
+@dataclass(frozen=True, eq=False)
+class DiagnosisResult:
+    """A diagnosis with the content of its files and its report."""
+
+    diagnosis: Diagnosis
+    """Findings, candidates and unexplained residuals."""
+    calibration: Calibration
+    """The extended calibration; that of the baseline without findings."""
+    tolerances: np.ndarray
+    """Tolerance of each parameter of the extended model."""
+    needed: dict[str, tuple[str, float]]
+    """As in `CalibrationResult`."""
+    observations: str
+    """Unit of the data: 'windows' or 'poses'."""
+    options: CalibrationOptions
+    """The requested models and settings."""
+    proposed: Calibration | None = None
+    """The calibration with the formulas proposed for the unexplained residual; None without a formula."""
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """Return the content of diagnosis.json."""
+        lags = {sensor: {'value': value, 'sd': sd, 'unit': 's'} for sensor, (value, sd) in self.lags.items()}
+        return to_mapping(self.diagnosis) | {'lags': lags, 'notes': self.notes}
+
+    @property
+    def lines(self) -> list[str]:
+        """The result as lines of text."""
+        words = [f'the {sensor} by {1e3 * value:.4g} +- {1e3 * sd:.2g} ms' for sensor, (value, sd) in self.lags.items()]
+        lag = [f'total lag: {", ".join(words)}'] * bool(words)
+        return [*diagnosis_lines(self.diagnosis), *(f'note: {note}' for note in self.notes), *lag]
+
+    @property
+    def notes(self) -> list[str]:
+        """Biases that step or wander on every axis: they count as noise of the sensor, not as unexplained residual."""
+        quiet = {sensor for sensor, rest in self.diagnosis.unexplained.items() if not rest.significant}
+        return [f'{reason.what}; no effect of the catalogue explains this step or wander'
+                for reason in unsteady(self.calibration, self.tolerances) if quiet.issuperset(reason.sensors)]
+
+    @property
+    def lags(self) -> dict[str, tuple[float, float]]:
+        """Sensor -> (total lag of its output, standard deviation), s; independent of how collinear lag effects share it."""
+        found = self.calibration
+        return total_lags(found.param_names, found.values, found.covariance)
+
+
+def diagnose_recording(source: Callable, table: Table, options: CalibrationOptions = CalibrationOptions(), *,
+                       provenance: dict[str, Any] | None = None, progress: Callable | None = None) -> DiagnosisResult:
+    """
+    Calibrate a recording, identify the errors of the model and their causes, and extend it.
+
+    Parameters
+    ----------
+    source : callable
+        Returns a new iterator of SampleBlock at each call.
+    table : Table
+    options : CalibrationOptions
+        The initial model; default bias and matrix, so that every other effect is tested.
+    provenance : dict, optional
+    progress : callable, optional
+        Called with the progress since the last call, percent.
+
+    Returns
+    -------
+    DiagnosisResult
+
+    """
+    windows = []
+
+    def read(step, numbered):
+        return [step.read(source(), session, Preflight(table.gravity_value), windows=windows if not windows else None) for session,
+                source in numbered]
+    report = _percent(progress) if progress else None
+    calibrated = calibrate_by_evidence([source], table, replace(options, as_asked=False), provenance=provenance, asking=report, mapper=read)
+    if calibrated.found is None:
+        raise too_few_windows(len(calibrated.result.gathered.spreads[0].windows))
+    result, diagnosis = calibrated.result, told(table, calibrated.found, calibrated=calibrated.result.solution)
+    proposed = _with_proposals(source, table, options, result, diagnosis, provenance)
+    traces = residual_traces(windows, table, diagnosis.baseline, after=proposed or diagnosis.solution)
+    diagnosis = replace(diagnosis, traces=traces)
+    if report:
+        report(1.0)
+    return DiagnosisResult(diagnosis, result.calibration, result.tolerances, result.needed, result.observations, baseline_options(options),
+                           proposed)
+
+
+def _with_proposals(source, table, options, result, diagnosis, provenance):
+    """Return the calibration of the extended model with the proposed formulas, or None without a formula."""
+    effects = proposed_effects(diagnosis)
+    if not effects:
+        return None
+    model = result.calibration.model
+    catalogue = model.catalogue.with_effects(*effects)
+    texts = {sensor: '+'.join([*(e.name for e in model.effects if e.sensor == sensor and e.role is not Role.LIMIT),
+                               *(e.name for e in effects if e.sensor == sensor)]) for sensor in (*SENSORS, 'reference')}
+    chosen = replace(options, accelerometer_model=texts['accelerometer'], gyroscope_model=texts['gyroscope'],
+                     reference_model=texts['reference'] or 'none', catalogue=catalogue, as_asked=True)
+    solution, gathered, gathered_model = solve_recordings([source], table, chosen)
+    # A formula determines changes of the output, not its zero: biases of the affected axes keep the uncertainty.
+    unsure = Demand(moves=tuple((moved, 1.0) for moved in biases_off(model, diagnosis.unexplained)))
+    return conclude(unsure.applied(solution), gathered, gathered_model, table=table, options=chosen, provenance=provenance).calibration
+
+
+def diagnose_without_table(source: Callable, options: CalibrationOptions = CalibrationOptions(), provenance: dict[str, Any] | None = None,
+                           *,
+                           progress: Callable | None = None) -> DiagnosisResult:
+    """
+    Calibrate a recording by hand, identify the errors of the model and their causes, and extend it (see `hand_diagnosis`).
+
+    Parameters
+    ----------
+    source : callable
+        Returns an iterator of SampleBlock.
+    options : CalibrationOptions
+        The initial model; default bias and matrix.
+    provenance, progress : optional
+        As in `diagnose_recording`.
+
+    Returns
+    -------
+    DiagnosisResult
+
+    """
+    preflight = Preflight(options.gravity)
+    recording = read_by_hand(source(), options.nominal, [preflight])
+    report = _percent(progress) if progress else None
+    result, evident = evident_result(recording, replace(options, as_asked=False), provenance, findings=preflight.findings, progress=report)
+    if evident.found is None:
+        raise too_few_poses(len(evident.hand.poses.start))
+    if report:
+        report(1.0)
+    return DiagnosisResult(told_by_hand(evident.found, evident.hand), result.calibration, result.tolerances, result.needed,
+                           result.observations,
+                           replace(options, accelerometer_model=options.accelerometer_model or BARE,
+                                   gyroscope_model=options.gyroscope_model or BARE))
+
+
+def _percent(advance):
+    """Return a function of the share done that calls `advance` with the increment in percent."""
+    done = [0.0]
+
+    def report(share):
+        advance(100 * share - done[0])
+        done[0] = 100 * share
+    return report
+
+
+def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
+    """Return the findings, the unexplained residual of each sensor and the effects without a test, as lines."""
+    lines = onset_lines(diagnosis.onset)
+    for number, finding in enumerate(diagnosis.findings, 1):
+        lines.append(f'{number}. {finding.title}: {finding.explanation}')
+        if finding.indistinguishable_from:
+            lines.append(f'   not separable in this recording from {", ".join(finding.indistinguishable_from)}; '
+                         f'to separate them: {finding.separating_motion}')
+    if not diagnosis.findings and not proposed_effects(diagnosis):
+        lines.append(nothing_named(diagnosis))
+    for sensor, rest in diagnosis.unexplained.items():
+        if rest.significant:
+            with_what = f'; it correlates with {rest.correlates_with}' if rest.correlates_with else ''
+            lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}'
+                         + (f'; {rest.where}' if rest.where else ''))
+        lines += [f'   {line}' if rest.significant else line for line in (*beyond_lines(sensor, rest), *formula_lines(sensor, rest))]
+    if diagnosis.not_testable:
+        lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
+    return lines
+
+
+def onset_lines(onset: Onset | None) -> list[str]:
+    """Return the moment at which parameters change, with their values before and after, as lines."""
+    if onset is None:
+        return []
+    largest = sorted(onset.before, key=lambda name: -abs(onset.after[name] - onset.before[name]))[:MOST_SHOWN]
+    states = [[in_words(state[name], onset.what, onset.units[name]).removesuffix(' 1') for state in (onset.before, onset.after)]
+              for name in largest]
+    values = '; '.join(f'{name} {before} before, {after} after' for name, (before, after) in zip(largest, states))
+    return [f'change at {onset.time:.1f} s of {onset.what}: {values}',
+            f'   it explains {100 * onset.share:.0f} % of the residual; other results: of the longer part; record again without the change']
+
+
+def beyond_lines(sensor: str, rest: Unexplained) -> list[str]:
+    """Return the axes, conditions and tones of an unexplained residual, as lines."""
+    lines = [f'axis {" and ".join(rest.axes)}'] * bool(rest.axes)
+    lines += [f'where: {sensor} {regime.axis}, {regime.text} ({100 * regime.share:.0f} % of it)' for regime in rest.regimes]
+    return [*lines, *(f'spectrum: {tone.text}' for tone in rest.tones)]
+
+
+def formula_lines(sensor: str, rest: Unexplained) -> list[str]:
+    """Return the formula that an unexplained residual follows and its gain, as lines."""
+    if rest.proposal is None:
+        return []
+    gain = formula_gain(rest)
+    before, low, high = (in_words(gain.heldout_rms_before * factor, sensor) for factor in (1.0, 1.0 - gain.ci95[1], 1.0 - gain.ci95[0]))
+    return [f'formula: {rest.proposal.sentence}', f'gain of the formula: {gain.measure} of the {sensor} {before} before, {low} to {high} '
+            'after (95 %)']
+
+
+def proposed_effects(diagnosis: Diagnosis) -> list[Effect]:
+    """Return the formulas of a diagnosis as effects."""
+    return [effect for rest in diagnosis.unexplained.values() if rest.proposal is not None for effect in rest.proposal.effects]
+
+
+def nothing_named(diagnosis: Diagnosis) -> str:
+    """Return the reason for a diagnosis without findings: no effect exceeds noise, or the best one is refused."""
+    much = [row for row in diagnosis.candidates if row.verdict in WHY_NOT and row.gain_alone > MUCH]
+    if not much:
+        return 'nothing found: no effect of the catalogue explains more than noise'
+    return (f'nothing named: {much[0].effect} explains much ({much[0].gain_alone:.0f} nats on held-out windows), '
+            f'but {WHY_NOT[much[0].verdict]}')
+
+
+def in_words(value: float, sensor: str, unit: str | None = None) -> str:
+    """Return a specific force or rate, or a value in another unit, in people's units."""
+    return error_text(value, unit or UNIT[sensor])

@@ -1,0 +1,212 @@
+"""Diagnosis of a calibration by hand: the search on poses and turns, the residuals of the poses, and the places of other offsets."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
+from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding
+from imu_calibration.calibration.diagnosis.separating_motion import motions_of
+from imu_calibration.calibration.diagnosis.traces import Traces
+from imu_calibration.calibration.hand_by_evidence import extended_by_hand
+from imu_calibration.effects.base import AXES, SENSORS
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.references.gravity.effect_rows import Block
+from imu_calibration.references.gravity.hand_calibration import HandCalibration, HandData
+from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.model_selection import HandInvestigation, investigate_by_hand
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.regime_variables import Variable, ranged
+from imu_calibration.selection.regimes import RestRegime, cleanest, tested_offset
+from imu_calibration.selection.residual_fit import LEAST_OF_AXIS
+from imu_calibration.selection.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations, where_most
+
+BY_CHANCE = 0.01
+"""Significance level of a regime, for all ranges of all variables."""
+MOST_OF_IT = 0.8
+"""Least share of an axis' residual that an offset there explains."""
+NORM = 'norm'
+"""Without a table only the component of the accelerometer's error along gravity is observable."""
+
+
+def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -> tuple[RestRegime, ...]:
+    """
+    Return the clearest regime of each axis.
+
+    Poses are too few for separate selection and test: the p-value of the likeliest range is multiplied by the number of ranges. Regimes
+    of larger scatter are not reported, since every other range of few poses has it.
+
+    Parameters
+    ----------
+    hand : HandCalibration
+        Of the baseline.
+    block : Block
+        The sensor's rows in poses.
+    residual : ndarray, shape (k, n_axes)
+        Residual of each pose, by a fit without it.
+
+    """
+    variables = _variables(hand, block)
+    names = AXES if residual.shape[1] == len(AXES) else (NORM,)
+    found = []
+    for axis, name in enumerate(names):
+        sd = np.sqrt(block.floor[:, axis])
+        rows = np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None]
+        regimes = [regime for variable in variables if (regime := _of_variable(block, name, rows, sd, variable)) is not None]
+        number = len(names) * sum(variable.marks.shape[1]**2 // 2 for variable in variables)
+        sure = [regime for regime in regimes if regime.p_value * number < BY_CHANCE and regime.share >= MOST_OF_IT]
+        found += sorted(sure, key=lambda regime: regime.cost)[:1]
+    return tuple(found)
+
+
+def _of_variable(block, axis, rows, sd, variable):
+    """Return the range of a variable in which an offset explains most, or None where it has too few values."""
+    prior, marks = (np.zeros(1), np.zeros(1)), variable.marks / sd[:, None]
+    best = next((chosen for chosen, offset in cleanest(rows, marks, prior, bins=variable.bins, cyclic=variable.cyclic) if offset), None)
+    if best is None:
+        return None
+    mark = marks[:, best].sum(axis=1)
+    share, p_value = tested_offset(rows, mark, prior, n_windows=len(rows))
+    bounds = variable.bounds(best)
+    return RestRegime(block.sensor, axis, variable.name, variable.words(best, bounds) + ', by another offset', share, p_value,
+                      np.isin(variable.bins, best), block.time, True, p_value, bounds)
+
+
+def _variables(hand: HandCalibration, block: Block) -> list[Variable]:
+    """Return the variables of regimes of poses: the attitude, the previous attitude, the time and the temperature."""
+    force = hand.gravity * hand.state.up
+    before = np.concatenate([force[:1], force[:-1]])
+    found = ranged('time', block.time, 's')
+    for k, axis in enumerate(AXES):
+        found += ranged(f'specific force along {axis}', force[block.pose, k], 'm/s^2', least=0.5)
+        found += ranged(f'specific force along {axis} in the pose before', before[block.pose, k], 'm/s^2', least=0.5)
+    warm = hand.poses.temperature_c
+    return found if warm is None else found + ranged('temperature', warm[block.pose], 'C', least=0.5)
+
+
+PER_TURN = 'rad/turn'
+"""Unit of the residual of turns: the angle between predicted and measured gravity after a turn."""
+
+
+def as_solution(hand: HandCalibration) -> Solution:
+    """Return a HandCalibration as the `Solution` of documents and reports."""
+    model = hand.model.model
+    order = [hand.param_names.index(name) for name in model.param_names]
+    held = np.array([hand.statuses[k] == 'held' for k in order])
+    information = np.zeros((len(order), len(order)))
+    own = [model.param_names.index(name) for name in hand.model.param_names]
+    information[np.ix_(own, own)] = hand.information
+    noise, rms, chi2 = {}, {}, {}
+    residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': _rates_left(hand)}
+    for sensor, scatter in (('accelerometer', 'pose'), ('gyroscope', 'drift')):
+        noise[sensor] = replace(hand.poses.noise[sensor], offset_sd=hand.statistics[f'{scatter}_scatter_sd'])
+        rms[sensor] = np.full(2, np.sqrt(np.mean(residuals[sensor]**2)))
+        chi2[sensor] = {'mean': None}
+    terms = {name: term[np.ix_(order, order)] for name, term in hand.terms.items()}
+    return Solution(model, hand.values[order], terms, held, noise, chi2, information, rms)
+
+
+def _rates_left(hand):
+    """Return the residual rates at rest, shape (k, 3)."""
+    poses, true = hand.poses, hand.gravity * hand.state.up
+    more = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time,
+                              temperature_c=poses.temperature_c)[0]
+    return poses.rate - hand.gyroscope[0] - more
+
+
+def traces_of(baseline: HandCalibration, hand: HandCalibration) -> Traces:
+    """Return the `Traces` of two calibrations: one point per pose, the accelerometer's residual along gravity."""
+    poses = hand.poses
+    true = hand.gravity * hand.state.up
+    errors = [{'accelerometer': h.norm_residuals()[:, None] * h.state.up, 'gyroscope': _rates_left(h)} for h in (baseline, hand)]
+    count = len(poses.start)
+    return Traces(poses.time, np.full(count, 'static'), np.zeros((count, 0)), true, np.zeros((count, 3)), poses.temperature_c, errors[0],
+                  errors[1], (poses.stop - poses.start).astype(float), None)
+
+
+def rest_of(hand: HandCalibration, inquiry: Any, named: Sequence[Question], *, sensor: str) -> Unexplained:
+    """Return the unexplained residual of one sensor: its rows at rest and its turns against the expectation from noise."""
+    used = list(inquiry.search.used(named))
+    residuals, sigma, rms, chosen = inquiry.evidence.residuals(used), -np.inf, 0.0, None
+    for block, residual in zip(inquiry.blocks, residuals):
+        if block.sensor != sensor:
+            continue
+        spare = residual.size - np.linalg.matrix_rank(block.rows[:, :, used].reshape(residual.size, -1))
+        if spare < 3:
+            continue
+        own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
+        if block.name == 'poses' or own > max(sigma, SIGNIFICANT):
+            size = 1.0 if block.duration is None else block.duration[:, None]**2   # the residual of a turn is an angle, of a pose a rate
+            excess = np.sum(residual**2 * size) / spare - np.mean(block.floor * size)
+            if own > sigma:
+                sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block
+    count = len(hand.poses.start)
+    first = next(k for k, block in enumerate(inquiry.blocks) if block.sensor == sensor)
+    layers, noise_sd = residuals[first], np.sqrt(inquiry.blocks[first].floor)
+    significant = bool(sigma > SIGNIFICANT and count >= LEAST_WINDOWS)
+    unit = None if chosen is None or chosen.duration is None else PER_TURN
+    if not significant:
+        return Unexplained(False, rms, float(max(sigma, -99.0)), None, 0.0, None, layers, noise_sd, unit)
+    name, share = correlate(_explanations(hand), layers / noise_sd)
+    if chosen is not None and chosen.name == 'turns' and name is None:
+        name = 'motion (turns between poses)'
+    heldout = inquiry.evidence.heldout_residuals(used)[first]
+    excess = ((heldout / noise_sd)**2 - 1.0).sum(axis=0)
+    axes = [AXES[k] for k in np.argsort(-excess) if excess[k] > LEAST_OF_AXIS * excess.max() > 0] if len(excess) == len(AXES) else []
+    return Unexplained(True, rms, float(sigma), name, share, where_most(hand.poses.time, layers, noise_sd), layers, noise_sd, unit,
+                       tuple(axes), regimes_by_hand(hand, inquiry.blocks[first], heldout))
+
+
+def _explanations(hand):
+    poses, up = hand.poses, hand.state.up
+    every = np.ones(len(up), bool)
+    yield from slow_explanations(poses.time, np.full(len(up), np.nan) if poses.temperature_c is None else poses.temperature_c)
+    yield 'direction of gravity', up, every
+    yield 'direction of gravity', np.stack([up[:, 0]**2 - up[:, 1]**2, up[:, 2]**2, up[:, 0] * up[:, 1], up[:, 1] * up[:, 2],
+                                            up[:, 0] * up[:, 2]], axis=1), every
+
+
+@dataclass(frozen=True, eq=False)
+class HandDiagnosis:
+    """A diagnosis of a recording without a table."""
+
+    diagnosis: Diagnosis
+    """Findings."""
+    hand: HandCalibration
+    """The extended calibration; the baseline's without findings."""
+
+
+def diagnose_by_hand(data: HandData, options: HandOptions = HandOptions(), progress: Callable | None = None) -> HandDiagnosis:
+    """
+    Diagnose the errors of a calibration by hand and their causes; arguments and errors as in `investigate_by_hand`.
+
+    Returns
+    -------
+    HandDiagnosis
+
+    """
+    found = investigate_by_hand(data, options, progress)
+    hand = extended_by_hand(data, found, options)
+    result = told_by_hand(found, hand)
+    if progress:
+        progress(1.0)
+    return HandDiagnosis(result, hand)
+
+
+def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
+    """Return the result of an investigation as a Diagnosis; `hand` is a calibration with all findings."""
+    inquiry, named = found.inquiry, list(found.named)
+    before, after = as_solution(found.baseline), as_solution(hand)
+
+    def gain_of(place):
+        return found.gain(named[:place], named[:place + 1], named[place].sensor)
+
+    findings = tuple(finding(inquiry.search, named, place, solution=after, share=inquiry.share, gain_of=gain_of, motion_of=motions_of)
+                     for place in range(len(named)))
+    gain = found.gain([], named, named[0].sensor) if named else None
+    count = len(found.baseline.poses.start)
+    return Diagnosis(findings, {s: rest_of(found.baseline, inquiry, named, sensor=s) for s in SENSORS},
+                     candidates_of(inquiry.search, named),
+                     tuple(found.not_testable), before, after, gain, count, count if named else 0, traces_of(found.baseline, hand))

@@ -1,0 +1,119 @@
+"""A diagnosis during the motion: its input, a solution, and its outcome as a status."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from imu_calibration.calibration.by_evidence import windows_to_ask
+from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines, in_words, nothing_named
+from imu_calibration.calibration.diagnosis.table_diagnosis import told
+from imu_calibration.calibration.live_snapshot import LiveSnapshot
+from imu_calibration.calibration.model_changes import Demand
+from imu_calibration.calibration.session import TableSession
+from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.selection.evidence import LEAST_WINDOWS
+from imu_calibration.selection.investigation import too_few_windows
+
+
+class Outcome(StrEnum):
+    """Outcome of a diagnosis."""
+
+    WAITING = 'waiting'
+    """It is not possible yet."""
+    OFF = 'off'
+    """It is disabled."""
+    FOUND = 'found'
+    """The model lacks something that has a name."""
+    NOTHING = 'nothing found'
+    """The model is adequate."""
+    UNEXPLAINED = 'unexplained'
+    """A residual is unexplained."""
+    FAILED = 'failed'
+    """It ended by a fault."""
+
+
+MATES, SIZE = 'mates of ', 'size of '
+"""Prefix of the name of each finding, and of EFFECT.PARAMETER with a number in SI: for programs."""
+WAITING, OFF, FOUND, NOTHING, UNEXPLAINED, FAILED = Outcome
+
+
+@dataclass(frozen=True)
+class DiagnosisState:
+    """Result of a diagnosis, or the reason why there is none."""
+
+    word: Outcome = WAITING
+    """Outcome."""
+    message: str = f'it follows a solution of at least {LEAST_WINDOWS} windows'
+    """One line."""
+    values: dict = field(default_factory=dict)
+    """Figures by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Outcome of a diagnosis, and its consequence for the calibration."""
+
+    state: DiagnosisState
+    """For display."""
+    demand: Demand | None = None
+    """Effects that the windows support; None where they could not be tested."""
+
+
+@dataclass(frozen=True, eq=False)
+class DiagnosisQuestion:
+    """Input of a diagnosis, for another thread."""
+
+    snapshot: LiveSnapshot
+    """Data of a solution."""
+
+    @property
+    def samples(self) -> dict:
+        """Numbers of samples: equal for two questions about the same ones."""
+        return self.snapshot.gathered.accumulator.samples
+
+    def answer(self, progress: Callable[[float], object] | None = None) -> Answer:
+        """Diagnose and return the `Answer`; `progress` is called with the share done and may raise to end it."""
+        try:
+            evidence = self.snapshot.evidence(progress)
+            if evidence.found is None:
+                raise too_few_windows(sum(len(spread.windows) for spread in self.snapshot.gathered.spreads))
+            calibrated = None if evidence.demand.changes.lacking else evidence.solution
+            return Answer(describe(told(self.snapshot.table, evidence.found, calibrated=calibrated)), evidence.demand)
+        except ImuCalibrationError as error:
+            return Answer(DiagnosisState(WAITING, str(error)))
+
+
+def question_about(live: TableSession | None) -> DiagnosisQuestion | None:
+    """Return the DiagnosisQuestion about the last solution of a session, or None without a table or while there are too few windows."""
+    return DiagnosisQuestion(live.last) if live is not None and live.last is not None and windows_to_ask(live.last.gathered) else None
+
+
+def describe(diagnosis: Diagnosis) -> DiagnosisState:
+    """Return the DiagnosisState of a Diagnosis: the first finding, or none, or the unexplained residual."""
+    values: dict[str, Any] = {'windows': diagnosis.windows, 'windows held out for the gain': diagnosis.locked}
+    rest = [line for line in diagnosis_lines(diagnosis) if line.startswith('unexplained')]
+    values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor, found.unit)
+               for sensor, found in diagnosis.unexplained.items() if found.significant}
+    if not diagnosis.findings:
+        return DiagnosisState(UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing_named(diagnosis), values)
+    first = diagnosis.findings[0]
+    message = f'{first.title}: {first.explanation}'
+    if first.indistinguishable_from:
+        others = ', '.join(first.indistinguishable_from)
+        message += f' This motion does not separate it from {others}; a motion that does: {first.separating_motion}'
+    low, high = first.gain.ci95
+    values = {'effect': first.effect, 'sensor': first.sensor, 'explanation': first.explanation,
+              **{name: f'{value:.4g} +- {sd:.2g} {unit}' for name, (value, sd, unit) in first.parameters.items()},
+              'p-value': f'{first.p_value:.2g}', 'held-out reduction': f'{first.gain.reduction:.3f}',
+              'held-out reduction, 95 % interval': f'{low:.3f} to {high:.3f}',
+              'held-out measure': f'{first.gain.sensor} {first.gain.measure}',
+              'indistinguishable from': ' '.join(first.indistinguishable_from),
+              'further findings': ' '.join(finding.effect for finding in diagnosis.findings[1:]),
+              'implausible': ' '.join(finding.effect for finding in diagnosis.findings if finding.implausible), **values}
+    for finding in diagnosis.findings:
+        values[MATES + finding.effect] = ' '.join(finding.indistinguishable_from)
+        sized = {finding.effect: finding.parameters, **finding.sizes_of_mates}
+        values |= {f'{SIZE}{effect}.{name}': repr(float(value)) for effect, sizes in sized.items() for name, (value, *_) in sizes.items()}
+    return DiagnosisState(FOUND, message, values)

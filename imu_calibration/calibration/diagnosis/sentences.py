@@ -1,0 +1,169 @@
+"""Chosen effects as findings, the same on a table and by hand, and as sentences that an engineer would write."""
+
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
+
+from imu_calibration.calibration.diagnosis.diagnosis_result import Candidate, Finding, parameters_of
+from imu_calibration.core.units import for_people, with_sd
+from imu_calibration.document.plausibility import beyond_known
+from imu_calibration.effects.base import Effect
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.selection.gain import Gain
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.search import FAMILY_WISE, Score, Search
+
+LEAVES_MOST = 'rejected: most of the residual would remain'
+"""Verdict on an effect that is significant, but removes too small a share."""
+DISAGREED = 'refused: the windows do not agree on it'
+"""Verdict on an effect with evidence from few windows only, or with contradictory windows."""
+
+
+def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], gain: Gain | None, *, n_clipped: int | None = None) -> str:
+    """
+    Return a finding in one or two sentences, with its size in common units.
+
+    Parameters
+    ----------
+    effect : Effect
+    parameters : dict
+        Name -> (value, sd, unit).
+    gain : Gain or None
+    n_clipped : int, optional
+        Samples at a limit.
+
+    """
+    values = [(name.split('.')[-1], *entry) for name, entry in parameters.items()]
+    amplitudes = effect.amplitudes(values)
+    # A parameter that is collinear with another, such as the bias, is not a size.
+    known = [entry for entry in amplitudes if abs(entry[1]) > 2 * entry[2]]
+    label, value, sd, unit = max(known or amplitudes, key=lambda v: abs(v[1]))
+    factor, unit = for_people(unit, effect.sensor)
+    size = _with_unit(' +- '.join(with_sd(value * factor, sd * factor)), unit)
+    if not known and len(values) > 1:
+        size = f'known here in combinations only, none of its values by itself: {size}'
+    if n_clipped is not None:
+        limit = _with_unit(f'{value * factor:.4g}', unit)
+        return f'{effect.explanation} The limit is {limit}; {n_clipped} samples at it and neighbouring samples were excluded.'
+    which = '' if len(amplitudes) == 1 else f' (largest: {label})'
+    when = f' at {values[-1][1]:.1f} s' if effect.located else ''
+    text = f'{effect.explanation} Its size is {size}{which}{when}.'
+    if gain is not None and gain.reduction > 0:
+        text += f' With it the {gain.sensor} residual of held-out {gain.measure} falls by {_percent(gain.reduction)}.'
+    return text
+
+
+def _percent(share):
+    return f'{100 * share:.0f} %' if share >= 0.01 else f'{100 * share:.1g} %'
+
+
+def _with_unit(number, unit):
+    return number if unit == '1' else f'{number} {unit}'
+
+
+def candidates_of(search: Search, named: Sequence[Question], *, agree: Callable[[Sequence[Question], Question], bool] | None = None,
+                  ) -> tuple[Candidate, ...]:
+    """
+    Return every effect that a search tested in addition to the findings, the strongest first; of a warm-up its best time constant.
+
+    `agree(chosen, question)` is whether the windows agree on one of the chosen effects.
+    """
+    found, mates, rows = {question.name for question in named}, {}, {}
+    for question in named:
+        for mate, _ in search.class_mates(named, question):
+            mates.setdefault(mate.name, question.name)
+    for question in search.questions:
+        alone = search.score([], question)
+        if question.name in rows and rows[question.name].gain_alone >= alone.gain:
+            continue
+        beside = None if question.name in found else search.score(named, question)
+        verdict = verdict_of(question.name, alone, beside, found=found, mates=mates)
+        if verdict == LEAVES_MOST and agree is not None and not agree([*named, question], question):
+            verdict = DISAGREED
+        rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, None if beside is None else beside.gain,
+                                        None if beside is None else beside.p_value, verdict)
+    return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
+
+
+def verdict_of(name: str, alone: Score, beside: Score | None, *, found: Collection[str], mates: dict[str, Any]) -> str:
+    """
+    Return 'found', 'as good as NAME', 'not needed in addition to the findings', 'no evidence', or why the effect was refused.
+
+    Parameters
+    ----------
+    name : str
+        Effect.
+    alone, beside : Score
+        Evidence on top of the baseline, and on top of the findings (None for a finding).
+    found : set of str
+        Findings.
+    mates : dict
+        Effects that would do as well -> finding.
+
+    """
+    if name in found:
+        return 'found'
+    if name in mates:
+        return f'as good as {mates[name]}'
+    if not alone.allowed and alone.p_value < FAMILY_WISE and alone.gain > 0:
+        return 'refused: its size is impossible, or within the steps of the encoders'
+    if beside is not None and beside.significant:
+        return LEAVES_MOST
+    if alone.significant:
+        return 'not needed in addition to the findings' if found else LEAVES_MOST
+    return 'no evidence'
+
+
+def finding(search: Search, named: Sequence[Question], place: int, *, solution: Solution, share: Callable, gain_of: Callable,
+            motion_of: Callable, shows: Callable = lambda place, mate, gain: True, rivals: Sequence[Question] = ()) -> Finding:
+    """
+    Return the Finding of the effect at `place` among the findings.
+
+    Parameters
+    ----------
+    search : Search
+        On which they were chosen.
+    named : list of Question
+        In the order found.
+    solution : Solution
+        Of the extended model; effects that it lacks are reported with the values of the search.
+    share : callable
+        ``share(named, question)``: share of the unexplained that the effect removes.
+    gain_of : callable
+        ``gain_of(place)``: the Gain of this effect on top of the preceding ones.
+    motion_of : callable
+        ``motion_of(question, mate)``: the motion that would separate two effects.
+    shows : callable
+        ``shows(place, mate, gain)``: whether an effect in the place of this one shows in the sensor that shows this one.
+    rivals : sequence of Question
+        Effects known to do nearly as well in its place.
+
+    """
+    question = named[place]
+    score = search.score([q for q in named if q is not question], question)
+    gain, explained = gain_of(place), share(named, question)
+    if question.effect.key in solution.model.slices:
+        parameters = parameters_of(solution, question.sensor, question.name)
+    else:
+        parameters = fitted(search, named, question)
+    text = sentence(question.effect, parameters, gain)
+    if score.implausible:
+        text += f' It {beyond_known(explained, question.sensor)}. It is in no model unless requested.'
+    mates = [*rivals, *(mate for mate, _ in search.class_mates(named, question)
+                        if mate.name not in {rival.name for rival in rivals} and shows(place, mate, gain))]
+    return Finding(question.name, question.sensor, text, parameters, score.p_value, score.gain, explained, gain,
+                   tuple(mate.name for mate in mates),
+                   motion_of(question, mates[0]) if mates else '', question.effect.against,
+                   {mate.name: _in_its_place(search, named, place, mate) for mate in mates}, score.implausible)
+
+
+def _in_its_place(search, named, place, mate):
+    """Return parameter name -> (value, unit) of an effect that replaces a finding."""
+    found = fitted(search, [*named[:place], mate, *named[place + 1:]], mate)
+    return {name: (value, unit) for name, (value, _, unit) in found.items()}
+
+
+def fitted(search: Search, named: Sequence[Question], question: Question) -> dict[str, tuple[float, float, str]]:
+    """Return parameter name -> (value, sd, unit) of a chosen effect as the search fitted it."""
+    names = question.effect.param_names()
+    return {name: (float(value), float(sd), question.effect.unit_of(k))
+            for k, (name, value, sd) in enumerate(zip(names, *search.estimate(named, question)))}

@@ -1,0 +1,133 @@
+"""From windows to findings: the function that tests every effect and describes the findings."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, parameters_of
+from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, sentence
+from imu_calibration.calibration.diagnosis.separating_motion import motions_of_one_joint, separating_motion
+from imu_calibration.calibration.diagnosis.traces import residual_traces
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.turntable.extended_model import extended_solution
+from imu_calibration.selection.explained_share import sensors_of
+from imu_calibration.selection.gain import Gain, gain_in_turn, heldout_gain
+from imu_calibration.selection.investigation import Investigation
+from imu_calibration.selection.residual_analysis import Examination, inquire
+from imu_calibration.selection.residual_summary import look_beyond
+
+MATE = 0.5
+"""Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's reduction."""
+
+HALF = 0.5
+"""Share of a finding that an unnamed effect would replace, from which it is reported with the finding."""
+
+
+def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
+             bias_processes: dict | None = None) -> Diagnosis:
+    """
+    Diagnose the errors of a model and their causes.
+
+    The recording is reduced once to sufficient statistics of every effect's columns per window; the search then tests each effect
+    that is not in the model on held-out windows.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        One recording in order; windows of kind 'unused' are not fitted, but are used by dead reckoning.
+    table : Table
+        The reference.
+    model : SensorModel
+        The model to diagnose.
+    progress : callable, optional
+        Called with the share that is done, in [0, 1].
+    bias_processes : dict, optional
+        Sensor -> its bias processes, where measured separately.
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    NotObservableError
+        When there are too few windows to hold any out.
+
+    """
+    result = told(table, inquire(windows, table, model, progress=progress, bias_processes=bias_processes))
+    result = replace(result, traces=residual_traces(windows, table, result.baseline, after=result.solution))
+    if progress:
+        progress(1.0)
+    return result
+
+
+def told(table: Table, found: Investigation, *, calibrated: Solution | None = None) -> Diagnosis:
+    """
+    Return the result of an investigation as a Diagnosis, without traces.
+
+    Parameters
+    ----------
+    table : Table
+        The reference.
+    found : Investigation
+    calibrated : Solution, optional
+        Solution of a model with all findings, with the reported parameters; default: the solution of the investigation.
+
+    """
+    attempt, named, limits = found.attempt, found.named, found.limits
+    rests = look_beyond(Examination.of(found, table))
+    baseline = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=[])
+    solution = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=named,
+                                 saturations=limits) if named or limits else baseline
+
+    def gain_of(place):
+        return heldout_gain(attempt, named[:place], named[:place + 1], sensors=sensors_of(named[place].effect))
+
+    def shows(place, mate, gain):
+        if gain.sensor not in sensors_of(mate.effect):
+            return False
+        own, other = (gain_in_turn(attempt, named[:place], [*named[:place], each], sensors=[gain.sensor]).reduction
+                      for each in (named[place], mate))
+        return MATE * own <= other
+
+    def motion_of(question, mate):
+        if len(table.joint_names) == 1:
+            return motions_of_one_joint(question, mate)
+        return separating_motion(solution, question, mate, gravity=table.gravity_value)
+
+    told_by = calibrated or solution
+    findings = [_clipping(limit, told_by) for limit in limits]
+    strange = found.implausible
+    findings += [finding(attempt.search, named, place, solution=solution if named[place] in strange else told_by,
+                         share=found.explained.share, gain_of=gain_of, motion_of=motion_of,
+                         shows=shows, rivals=_rivals(found, named[place]))
+                 for place in range(len(named))]
+    sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
+    return Diagnosis(tuple(findings), rests, candidates_of(attempt.search, named, agree=attempt.windows_agree),
+                     tuple(found.not_testable),
+                     baseline, solution, heldout_gain(attempt, [], named, sensors=sensors), len(found.used), int(np.sum(attempt.locked)),
+                     onset=found.onset)
+
+
+def _rivals(found, question):
+    """Return alternatives to a finding that fit nearly as well, and doubtful effects that would replace half of it."""
+    near = [rival.other for rival in found.rivals if rival.question.name == question.name]
+    values = dict(zip(found.attempt.space.names, found.attempt.values(found.named)))
+    own = [found.attempt.space.names[k] for k in question.parameters]
+    for other in found.doubtful:
+        moved = found.attempt.moved_by(found.named, other)
+        near += [other] if any(abs(moved.get(name, 0.0)) > HALF * abs(values[name]) for name in own) else []
+    return near
+
+
+def _clipping(limit, solution):
+    effect = solution.model.find(limit.sensor, Role.LIMIT)
+    parameters = parameters_of(solution, limit.sensor, effect.name)
+    gain = Gain(limit.sensor, 'clipped samples', limit.rms_before, limit.rms_after, (float('nan'), float('nan')), 0)
+    return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, n_clipped=limit.n_clipped), parameters, limit.p_value,
+                   limit.n_expected, 1.0, gain, (), '')

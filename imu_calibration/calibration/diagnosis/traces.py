@@ -1,0 +1,318 @@
+"""Measurement against the simulation of two models: residuals over short blocks, segments, residual power and dead reckoning."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.columns import INPUT_OF, warped_reference
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.kinematics.strapdown import drift_over
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window, all_samples, chunks
+from imu_calibration.selection.gain import MEASURES, Gain, reduction_interval
+from imu_calibration.selection.saturation import measured
+from imu_calibration.simulation.session import predict_windows
+
+PER_DECADE = 6
+"""Frequency bands of the spectrum per decade."""
+LOWEST, HIGHEST = -2, 5
+"""Decades of the lowest and highest edge, Hz."""
+EDGES = 10.0**np.linspace(LOWEST, HIGHEST, (HIGHEST - LOWEST) * PER_DECADE + 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Distance:
+    """Residual power of one sensor before and after an extension."""
+
+    edges: np.ndarray
+    """Edges of the frequency bands, Hz, shape (m + 1,)."""
+    power: np.ndarray
+    """Mean square of the residual within windows by model (before, after) and band, shape (2, m, 3)."""
+    noise: np.ndarray
+    """Mean square of the noise in each band, from the spectrum of the windows at rest, shape (m, 3)."""
+    means: np.ndarray
+    """Mean square of the window means of the residual before and after, shape (2, 3)."""
+    means_noise: np.ndarray
+    """Mean square of the noise of window means, shape (3,)."""
+    gains: dict[str, Gain]
+    """Measure of a held-out gain -> the same gain on all windows, all axes and noise included."""
+
+    def bands(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
+        """
+        Return (band, rms beyond noise (2, 3), rms of the noise (3,)) of the window means and of each decade, m/s^2 or rad/s.
+
+        ``sqrt(max(mean square of measured - simulated - that of the noise, 0))``.
+        """
+        found = [('window means', self.means, self.means_noise)]
+        decade = np.floor(np.log10(self.edges[:-1]) + 1e-9).astype(int)
+        for each in np.unique(decade):
+            rows = decade == each
+            if self.power[0, rows].any():
+                found.append((f'{10.0**each:g} to {10.0**(each + 1):g} Hz', self.power[:, rows].sum(axis=1), self.noise[rows].sum(axis=0)))
+        return [(name, np.sqrt(np.maximum(power - noise, 0.0)), np.sqrt(noise)) for name, power, noise in found]
+
+    def density(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        Return (frequency (k,), amplitude density of the residual (2, k, 3), of the noise (k, 3)), per sqrt(Hz).
+
+        Bands without data and the last one are left out.
+        """
+        rows = self.power[0].any(axis=1)
+        rows[-1] = False   # the Nyquist frequency cuts it
+        width = np.diff(self.edges)[rows, None]
+        return (np.sqrt(self.edges[:-1] * self.edges[1:])[rows], np.sqrt(self.power[:, rows] / width), np.sqrt(self.noise[rows] / width))
+
+    def to_mapping(self) -> dict:
+        """Return plain data: rms beyond noise before and after, and of the noise, by band, in SI units."""
+        return {'bands': [{'band': name, 'before': rms[0].tolist(), 'after': rms[1].tolist(), 'noise': noise.tolist()}
+                          for name, rms, noise in self.bands()],
+                'reduction': {measure: {'value': gain.reduction, 'ci95': list(gain.ci95)} for measure, gain in self.gains.items()}}
+
+
+class DistanceSums:
+    """Accumulates the residual power of windows; memory does not grow with the recording."""
+
+    def __init__(self) -> None:
+        count = len(EDGES) - 1
+        self._power = {sensor: np.zeros((2, count, 3)) for sensor in SENSORS}
+        self._rest = {sensor: np.zeros((count, 3)) for sensor in SENSORS}
+        self._means = {sensor: np.zeros((2, 3)) for sensor in SENSORS}
+        self._rows: dict[str, list] = {sensor: [] for sensor in SENSORS}
+        self._noise = {sensor: np.zeros(3) for sensor in SENSORS}
+        self._freedom = np.zeros((2, count))   # of all windows, of windows at rest
+        self._samples = self._windows = 0
+
+    def add(self, window: Window, residuals: Sequence[Mapping[str, np.ndarray]], noise: Mapping[str, NoiseModel]) -> None:
+        """Add a window with its residuals (before, after: sensor -> (n, 3)) and the noise of each sensor."""
+        n, rest = len(window), window.kind == 'static'
+        if n < 4 or not window.period:
+            return
+        line = np.fft.rfftfreq(n, window.period)[1:]
+        place = np.clip(np.searchsorted(EDGES, line, side='right') - 1, 0, len(EDGES) - 2)
+        freedom = np.full(len(line), 2.0)
+        freedom[-1] = 1.0 if n % 2 == 0 else 2.0
+        self._freedom[:2 if rest else 1] += np.bincount(place, freedom, len(EDGES) - 1)
+        self._samples += n
+        self._windows += 1
+        for sensor in SENSORS:
+            self._noise[sensor] += noise[sensor].low_variance / n
+            row = [n, rest]
+            for k, own in enumerate(residuals):
+                mean = own[sensor].mean(axis=0)
+                squares = np.abs(np.fft.rfft(own[sensor], axis=0)[1:])**2 * freedom[:, None] / n
+                band = np.stack([np.bincount(place, column, len(EDGES) - 1) for column in squares.T], axis=1)
+                self._power[sensor][k] += band
+                self._means[sensor][k] += mean**2
+                row += [band.sum(), mean @ mean]
+                if rest and k == len(residuals) - 1:
+                    self._rest[sensor] += band
+            self._rows[sensor].append(row)
+
+    def distances(self) -> dict[str, Distance]:
+        """Return sensor -> Distance of the windows up to now."""
+        edge = int(np.max(np.flatnonzero(self._freedom[0]), initial=0)) + 2
+        return {sensor: self._distance(sensor, edge) for sensor in SENSORS}
+
+    def _distance(self, sensor, edge):
+        known = np.flatnonzero(self._freedom[1])
+        density = self._rest[sensor][known] / self._freedom[1][known, None]
+        nearest = np.abs(np.arange(edge - 1)[:, None] - known).argmin(axis=1) if len(known) else []
+        noise = density[nearest] * self._freedom[0][:edge - 1, None] if len(known) else np.zeros((edge - 1, 3))
+        return Distance(EDGES[:edge], self._power[sensor][:, :edge - 1] / self._samples, noise / self._samples,
+                        self._means[sensor] / self._windows, self._noise[sensor] / self._windows, self._gains(sensor))
+
+    def _gains(self, sensor):
+        """Return measure -> Gain, in the order of `MEASURES`."""
+        n, rest, *squares = np.array(self._rows[sensor]).T
+        models, still, found = (squares[:2], squares[2:]), rest > 0, {}
+        pairs = ([(within + n * mean, 3 * n) for within, mean in models], [(mean, 0 * n + 3) for _, mean in models],
+                 [(within, 3 * (n - 1)) for within, _ in models], [(mean[still], 3 + 0 * mean[still]) for _, mean in models])
+        for measure, pair in zip(MEASURES, pairs):
+            rms = [float(np.sqrt(total.sum() / max(number.sum(), 1))) for total, number in pair]
+            found[measure] = Gain(sensor, measure, *rms, reduction_interval(pair), len(pair[0][0]))
+        return found
+
+
+BLOCK = 0.25
+"""Residuals are averaged over this time for plots, s."""
+DEAD_RECKONING = 50.0
+"""Length of dead reckoning, s."""
+GAP = 0.1
+"""Longest step between samples of a stretch, s."""
+MOST_STRETCHES = 12
+"""Stretches of dead reckoning, evenly spread over a longer recording."""
+SEGMENT, POINTS = 10.0, 400
+"""Length of the segment with the largest difference, s, and its number of points in a plot."""
+
+
+@dataclass(frozen=True, eq=False)
+class OverlaySegment:
+    """Measured and simulated signal of one axis."""
+
+    time: np.ndarray
+    """Seconds since the first sample, shape (n,)."""
+    signals: dict[str, np.ndarray]
+    """'measured', 'simulated before', 'simulated after': m/s^2 or rad/s, shape (n,); samples, or means of equal numbers of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Traces:
+    """Residuals averaged over short blocks, before and after, with the variables of their plots."""
+
+    time: np.ndarray
+    """Middle of each block, s, shape (n,)."""
+    kind: np.ndarray
+    """Kind of its window, shape (n,)."""
+    position: np.ndarray
+    """Joint angles, rad, shape (n, n_joints)."""
+    force_s: np.ndarray
+    """Reference specific force, m/s^2, shape (n, 3)."""
+    rate_s: np.ndarray
+    """Reference rate, rad/s, shape (n, 3)."""
+    temperature_c: np.ndarray | None
+    """Temperature, shape (n,), or None."""
+    before: dict
+    """Sensor -> measured minus predicted by the baseline, shape (n, 3)."""
+    after: dict
+    """Sensor -> measured minus predicted by the extended model, shape (n, 3)."""
+    samples: np.ndarray
+    """Samples in each block, shape (n,)."""
+    dead_reckoning: dict | None
+    """{'seconds', 'position_before', 'position_after', 'velocity_before', 'velocity_after', 'stretches'}: medians, m and m/s, or None when
+    no stretch of the recording is long enough."""
+    segments: dict[str, list[OverlaySegment]] = field(default_factory=dict)
+    """Sensor -> for each axis the segment with the largest residual before."""
+    distances: dict[str, Distance] = field(default_factory=dict)
+    """Sensor -> residual power by band; empty by hand."""
+
+
+def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *, after: Solution | Calibration) -> Traces:
+    """
+    Return the Traces of two models on a recording.
+
+    Windows are predicted in chunks, so that memory does not grow with the number of samples.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        Windows of kind 'unused' are used for dead reckoning and segments only.
+    table : Table
+    before : Solution
+        Baseline, with the noise of both sensors.
+    after : Solution or Calibration
+        Extended model.
+
+    """
+    models = before, after
+    sums, parts, counts, warmth = DistanceSums(), [], [], []
+    for group in chunks([window for window in windows if window.kind != 'unused']):
+        residuals, against = _errors(group, table, models), _variables(group, table, before)
+        ends = np.cumsum([len(window) for window in group])
+        for window, stop in zip(group, ends):
+            rows = slice(stop - len(window), stop)
+            sums.add(window, [{sensor: own[rows] for sensor, own in each.items()} for each in residuals], before.noise)
+        block, number, n_blocks = _blocks(group)
+        values = [np.concatenate([w.time for w in group]), *against[:3], *(each[s] for each in residuals for s in SENSORS)]
+        parts.append([_block_mean(value, block, number) for value in values])
+        warmth.append(None if against[3] is None else _block_mean(against[3], block, number))
+        counts.append((number, np.repeat([str(w.kind) for w in group], n_blocks)))
+    known = [each for each in warmth if each is not None]
+    temperature = np.concatenate(known) if len(known) == len(warmth) else None
+    time, position, force_s, rate_s, *errors = (np.concatenate(column) for column in zip(*parts))
+    old, new = (dict(zip(SENSORS, errors[k:k + 2])) for k in (0, 2))
+    segments = {sensor: [_segment(windows, table, models, sensor, axis, *_largest(time, old[sensor][:, axis])) for axis in range(3)]
+                for sensor in SENSORS}
+    return Traces(time, np.concatenate([kind for _, kind in counts]), position, force_s, rate_s, temperature, old, new,
+                  np.concatenate([number for number, _ in counts]), _dead_reckoning(windows, table, models), segments, sums.distances())
+
+
+def _largest(time, residual):
+    """Return start and end of the segment of `SEGMENT` seconds with the largest sum of squares of a residual."""
+    sums = np.concatenate([[0.0], np.cumsum(residual**2)])
+    stop = np.searchsorted(time, time + SEGMENT)
+    first = int(np.argmax(sums[stop] - sums[:-1]))
+    return time[first] - BLOCK, time[first] + SEGMENT
+
+
+def _segment(windows, table, models, sensor, axis, start, stop):
+    inside = [window for window in windows if window.time[-1] >= start and window.time[0] <= stop]
+    time = np.concatenate([window.time for window in inside])
+    found = {'measured': np.concatenate([measured(window, sensor)[:, axis] for window in inside])}
+    for name, model in zip(('simulated before', 'simulated after'), models):
+        found[name] = predict_windows(inside, table, model.model, values=model.values)[sensor][:, axis]
+    rows = np.flatnonzero((time >= start) & (time <= stop))
+    size = max(1, len(rows) // POINTS)
+    rows = rows[:len(rows) // size * size].reshape(-1, size)
+    return OverlaySegment(time[rows].mean(axis=1), {name: signal[rows].mean(axis=1) for name, signal in found.items()})
+
+
+def _errors(windows, table, models):
+    """Return sensor -> measured minus predicted, of each model."""
+    outputs = {sensor: np.concatenate([measured(window, sensor) for window in windows]) for sensor in SENSORS}
+    predicted = (predict_windows(windows, table, model.model, values=model.values) for model in models)
+    return [{sensor: outputs[sensor] - each[sensor] for sensor in SENSORS} for each in predicted]
+
+
+def _variables(windows, table, model):
+    """Return position, specific force, rate and temperature (or None) of the reference at the samples, at the values of a model."""
+    motion, temperature, rows = all_samples(windows)
+    reference = _references(model, table, motion, temperature)
+    return (motion.position[rows], reference['accelerometer'].force_s[rows], reference['gyroscope'].rate_s[rows],
+            None if temperature is None else temperature[rows])
+
+
+def _references(model, table, motion, temperature):
+    """Return sensor -> the Reference of its samples at the values of a model."""
+    return {s: warped_reference(model.model.at(model.values), s, table, motion=motion, temperature_c=temperature) for s in SENSORS}
+
+
+def _blocks(windows):
+    """Return the block of each sample, the number of samples of each block and of blocks of each window; blocks end with their window."""
+    places = [np.unique(((window.time - window.time[0]) / BLOCK).astype(int), return_inverse=True)[1] for window in windows]
+    n_blocks = [int(place[-1]) + 1 for place in places]
+    block = np.concatenate([start + place for start, place in zip(np.cumsum([0, *n_blocks]), places)])
+    return block, np.bincount(block), n_blocks
+
+
+def _block_mean(values, block, number):
+    columns = values.reshape(len(values), -1)
+    means = np.stack([np.bincount(block, column, len(number)) / number for column in columns.T], axis=1)
+    return means[:, 0] if values.ndim == 1 else means
+
+
+def _dead_reckoning(windows, table, models):
+    """Return medians over stretches of 50 s without gaps, or None."""
+    stretches, run = [], []
+    for window in windows:
+        if run and not 0 < window.time[0] - run[-1].time[-1] <= GAP:
+            run = []
+        run.append(window)
+        if window.time[-1] - run[0].time[0] > DEAD_RECKONING:
+            stretches.append(run)
+            run = []
+    if not stretches:
+        return None
+    chosen = [stretches[k] for k in np.unique(np.linspace(0, len(stretches) - 1, MOST_STRETCHES).round().astype(int))]
+    drifts = [_drifts(stretch, table, models) for stretch in chosen]
+    velocity, position = (np.median([[getattr(drift, name)[0] for drift in pair] for pair in drifts], axis=0) for name in
+                          ('velocity', 'position'))
+    return {'seconds': DEAD_RECKONING, 'position_before': float(position[0]), 'position_after': float(position[1]),
+            'velocity_before': float(velocity[0]), 'velocity_after': float(velocity[1]), 'stretches': len(chosen)}
+
+
+def _drifts(windows, table, models):
+    """Return the Drift of each model over the first `DEAD_RECKONING` seconds of some windows."""
+    motion, temperature, rows = all_samples(windows)
+    time, found = np.concatenate([window.time for window in windows]), []
+    for model, error in zip(models, _errors(windows, table, models)):
+        reference, felt = _references(model, table, motion, temperature), {}
+        for sensor in SENSORS:
+            matrix = model.model.value(sensor, Role.LINEAR, model.values)
+            felt[sensor] = getattr(reference[sensor], INPUT_OF[sensor])[rows] + np.linalg.solve(matrix, error[sensor].T).T
+        true = replace(reference['accelerometer'].select(rows), time=time, rate_s=reference['gyroscope'].rate_s[rows])
+        found.append(drift_over(true, felt['accelerometer'], felt['gyroscope'], seconds=DEAD_RECKONING))
+    return found

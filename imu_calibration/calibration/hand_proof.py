@@ -1,0 +1,177 @@
+"""Evaluation of a calibration by hand on held-out poses and turns."""
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+
+from imu_calibration.calibration.proof import compared
+from imu_calibration.compensation.compensate import compensate
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.uncorrected import LAST_SHARE, Uncorrected, uncorrected_in_time
+from imu_calibration.effects.applied import applied_values
+from imu_calibration.estimation.scaled_solve import scaled_lstsq
+from imu_calibration.estimation.status import HELD
+from imu_calibration.kinematics.preintegration import integrate_turn
+from imu_calibration.references.gravity.equations import COMPONENTS, Poses, TurnData, between_middles, build_system
+from imu_calibration.references.gravity.hand_calibration import HandCalibration
+from imu_calibration.references.gravity.hand_options import ByHandSettings
+from imu_calibration.references.gravity.hand_parameters import GYRO_BIAS, GYRO_MATRIX
+from imu_calibration.references.gravity.poses import distinct_attitudes
+
+FOLDS = 8
+"""Number of held-out parts."""
+ATTITUDES_LEAST = 10
+"""Fewest remaining attitudes when a part is held out: nine parameters of the accelerometer need one equation each."""
+FEW_ATTITUDES = 6
+"""Fewest remaining attitudes when one pose is held out: biases and scale factors of the accelerometer need one equation each."""
+TURNS_LEAST = 6
+"""Fewest remaining turns, and fewest held-out turns in total."""
+PER_TURN = 'rad per turn'
+"""Unit of the angle between rotated and observed gravity."""
+
+
+def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: ByHandSettings) -> dict:
+    """
+    Return the proof of a calibration by hand: sensor -> entry of a document (see `calibration.proof`).
+
+    Every eighth pose, with few attitudes one pose, is held out with the turns that begin or end there: one step from the solution without
+    their rows. The error of the accelerometer is the length of its corrected reading in a pose less gravity; that of the
+    gyroscope the angle between gravity rotated by its rates and gravity in the pose at the end of a turn. Readings are corrected as by
+    compensation; with effects in time the last third of the poses is evaluated. With too few poses or turns there is no entry.
+
+    Parameters
+    ----------
+    hand : HandCalibration
+    turns : sequence of TurnData
+        Turns of the estimate.
+    settings : ByHandSettings
+
+    """
+    poses, model, uncorrected = hand.poses, hand.model, uncorrected_by_hand(hand)
+    plain = replace(model, gyro_factor=1.0).nominal
+    judged = poses.time >= (LAST_SHARE * end_by_hand(poses) if uncorrected.sizes else 0.0)
+    norms, angles = [], []
+    for out, without in held_out_values(hand, turns, settings):
+        values, part = _applied(model, without, uncorrected.centre), _selected(poses, out & judged)
+        left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last]) and judged[turn.first]]
+        norms.append([(np.linalg.norm(_corrected(model, each, part.force, np.zeros_like(part.force), part.temperature_c).force, axis=1)
+                       - hand.gravity)**2 for each in (plain, values)])
+        if left and len(turns) - len(left) >= TURNS_LEAST:
+            angles.append([_missed(model, values, poses, left, gyroscope)**2 for gyroscope in (plain, values)])
+    if not norms:
+        return {}
+    proof = {'accelerometer': _entry(norms, 'm/s^2')}
+    if sum(part[0].size for part in angles) >= TURNS_LEAST:
+        proof['gyroscope'] = _entry(angles, PER_TURN)
+    return proof
+
+
+def held_out_values(hand: HandCalibration, turns: Sequence[TurnData], settings: ByHandSettings) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return (mask of the held-out poses, parameters estimated without them) of each fold; none with too few poses."""
+    known = _Rows(hand, turns)
+    return [(out, known.values_without(out)) for out in _folds(hand.poses, settings)]
+
+
+def _folds(poses, settings):
+    """Return masks of the poses to hold out in turn: an eighth of them, or with few attitudes one pose; none with too few."""
+    number = np.arange(len(poses.start))
+    for count, least in ((FOLDS, ATTITUDES_LEAST), (len(number), FEW_ATTITUDES)):
+        folds = [number % count == fold for fold in range(count)]
+        if all(distinct_attitudes(poses.force[~out], settings.pose_apart) >= least for out in folds):
+            return folds
+    return []
+
+
+def end_by_hand(poses: Poses) -> float:
+    """Return the end of the last pose, s since the first sample."""
+    return float(poses.time[-1] + 0.5 * (poses.stop[-1] - poses.start[-1]) * poses.period)
+
+
+def uncorrected_by_hand(hand: HandCalibration) -> Uncorrected:
+    """Return the effects in time that compensation replaces by their value at the end of the recording."""
+    values = hand.model.in_model_order(hand.state.values)
+    return uncorrected_in_time(hand.model.model.at(values), values, hand.poses.time, end=end_by_hand(hand.poses))
+
+
+def _applied(model, values, centre):
+    """Return the parameters that compensation applies, in the order of the HandModel."""
+    sensors = model.model
+    known = dict(zip(sensors.param_names, applied_values(sensors, model.in_model_order(values), centre), strict=True))
+    return np.array([known[name] for name in model.param_names])
+
+
+class _Rows:
+    """The weighted equations at the solution, each row with its poses."""
+
+    def __init__(self, hand, turns):
+        model, count = hand.model, len(hand.poses.start)
+        system = build_system(model, hand.state, hand.used_poses, turns=turns)
+        scatter = np.array([*(hand.statistics[f'{name}_scatter_sd']**2 for name in COMPONENTS), 0.0])
+        weight = 1.0 / np.sqrt(system.noise + scatter[system.component])
+        held = np.array([dict(zip(hand.param_names, hand.statuses)).get(name) == HELD for name in model.param_names])
+        self.values, self.free = hand.state.values, ~held
+        self.rows = np.column_stack([system.nuisance, system.main[:, self.free], system.residual]) * weight[:, None]
+        ends = [(turn.first, turn.last) if turn.rotation is None else (count, count) for turn in turns
+                for _ in range(2 if turn.rotation is None else 3)]
+        self.poses = np.concatenate([np.tile(np.repeat(np.arange(count), 3)[:, None], (3, 2)), np.array(ends, int).reshape(-1, 2)])
+        prior = np.diag(1.0 / model.priors)[self.free][:, self.free]
+        self.known = np.column_stack([np.zeros((len(prior), system.nuisance.shape[1])), prior,
+                                      ((model.nominal - self.values) / model.priors)[self.free]])
+
+    def values_without(self, out):
+        """Return the parameters without some poses and the turns that begin or end there."""
+        rows = self.rows[~np.append(out, False)[self.poses].any(axis=1)]
+        rows = np.concatenate([rows, self.known])
+        values = self.values.copy()
+        values[self.free] += scaled_lstsq(rows[:, :-1], rows[:, -1])[-int(self.free.sum()):]
+        return values
+
+
+def _entry(parts, unit):
+    before, after = (np.concatenate(side) for side in zip(*parts))
+    return compared(before, after, np.ones(len(before)), components=1) | {'unit': unit, 'windows': len(before)}
+
+
+def _selected(poses, mask):
+    """Return some of the poses."""
+    parts = {f.name: getattr(poses, f.name) for f in fields(poses)}
+    return replace(poses, **{name: part[mask] for name, part in parts.items() if isinstance(part, np.ndarray)})
+
+
+def _corrected(model, values, force, rate, temperature_c):
+    """Return readings corrected as by compensation with some parameters."""
+    own = model.in_model_order(values)
+    known = Calibration(model.model.at(own), own, np.zeros((len(own),) * 2), (HELD,) * len(own))
+    return compensate(known, force, rate, alpha_s=np.zeros_like(force), temperature_c=temperature_c)
+
+
+def _missed(model, values, poses, turns, gyroscope):
+    """Return the angle errors of turns, rad, with the accelerometer of `values` and the parameters `gyroscope` of the gyroscope."""
+    mixed = values.copy()
+    for part in (GYRO_BIAS, GYRO_MATRIX, model.extra_index('gyroscope')):
+        mixed[part] = gyroscope[part]
+    true = _corrected(model, values, poses.force, np.zeros_like(poses.force), poses.temperature_c).force
+    up = true / np.linalg.norm(true, axis=1, keepdims=True)
+    rates = [_corrected(model, mixed, turn.force, turn.rate, turn.temperature_c).rate for turn in turns]
+    return np.array([turn_error(poses, turn, rate, up=up) for turn, rate in zip(turns, rates, strict=True)])
+
+
+def turn_error(poses: Poses, turn: TurnData, rates: np.ndarray, *, up: np.ndarray) -> float:
+    """
+    Return the angle between the direction of gravity after a turn and that before it rotated by corrected rates, rad.
+
+    Parameters
+    ----------
+    poses : Poses
+    turn : TurnData
+    rates : array, shape (n, 3)
+        Corrected rates during the turn, rad/s; samples that are not finite are omitted.
+    up : array, shape (n_poses, 3)
+        Unit vector of gravity in each pose.
+
+    """
+    known = np.isfinite(rates).all(axis=1)
+    mat_ji = integrate_turn(turn.time[known], rates[known], bias=np.zeros(3), matrix=np.eye(3)).mat_ji
+    rotated, last = between_middles(poses, turn, mat_ji) @ up[turn.first], up[turn.last]
+    return float(np.arctan2(np.linalg.norm(np.cross(rotated, last)), rotated @ last))

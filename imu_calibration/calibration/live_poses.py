@@ -1,0 +1,242 @@
+"""Live calibration by hand: poses are counted, the missing motion is reported, and the result equals that of the recording."""
+
+import copy
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imu_calibration.calibration.coverage import Coverage
+from imu_calibration.calibration.effect_states import GroupState, group_states, waiting_groups
+from imu_calibration.calibration.hand_result import HandResult
+from imu_calibration.calibration.hand_workflow import HandRecording, calibrate_samples_by_hand
+from imu_calibration.calibration.next_pose import hand_coverage
+from imu_calibration.calibration.pose_scan import NOTHING, hand_status, look_for_poses
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SessionStatus, SolvePacer
+from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.core.errors import InputError, NotObservableError
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.effects.sensor_model import BASE, SensorModel
+from imu_calibration.preprocessing.stamping import StampLine
+from imu_calibration.preprocessing.stream_cleaning import StreamCheck
+from imu_calibration.preprocessing.window import WindowSettings
+from imu_calibration.references.gravity.hand_calibration import POSES_FULL, POSES_LEAST
+from imu_calibration.references.gravity.hand_options import hand_options
+from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.references.gravity.sample_store import HandStore
+from imu_calibration.references.options import CalibrationOptions
+
+SEARCH_SHARE = 0.05
+"""Largest share of time for the search for rest: after an hour at 200 Hz a search runs every ten seconds or so."""
+SEARCH_STEP = 0.5
+"""Least duration of new samples between searches for rest, s."""
+_FIRST_NEEDS = {'accelerometer': f'hold it still in {POSES_FULL} different attitudes',
+                'gyroscope': 'turn it from one attitude to the next, within half a minute'}
+MOST_POSES = 200
+"""The computation time grows with the third power of the number of poses; the oldest are discarded."""
+
+
+class LiveByHand:
+    """
+    One live session without a table: `push` arriving samples, `solve` when due.
+
+    The samples are cleaned, searched and solved by the functions for recordings, and all are kept up to the memory limit: the result
+    equals `workflow.calibrate_without_table` on the same samples. Beyond the limit (`hand_samples`) it is the result for the
+    kept samples. A clock reset, for which a recording is refused, is treated as a pause.
+
+    Parameters
+    ----------
+    options : CalibrationOptions
+        Requested model and reference.
+    settings : LiveSettings
+    by_hand : LiveByHandSettings
+    saved : bytes, optional
+        Return value of `saved` in an earlier run.
+    clock : callable
+        Seconds of a monotonic clock.
+
+    Raises
+    ------
+    InputError
+        When a requested effect needs a table, or temperatures.
+
+    """
+
+    def __init__(self, options: CalibrationOptions, settings: LiveSettings, by_hand: LiveByHandSettings = LiveByHandSettings(), *,
+                 saved: bytes | None = None, clock: Callable[[], float] = time.monotonic):
+        self.options, self.settings, self._clock = by_hand.at_place(options), settings, clock
+        self._asked = hand_options(self.options)
+        _check_model(self.model)
+        self._check, self._store, self._drops = StreamCheck(), HandStore(by_hand.hand_samples), {}
+        if saved is not None:
+            self._store.load(saved)
+        self._pacer, self._unsearched, self._reported_ns = SolvePacer(SEARCH_SHARE), 0, None
+        self._shown: tuple[tuple, Coverage] | None = None
+        self.found = NOTHING
+        self.result: HandResult | None = None
+        self._search(self._store)
+
+    @property
+    def model(self) -> SensorModel:
+        """The model, as far as known before a solution."""
+        asked = self._asked
+        return SensorModel(asked.accelerometer or BASE, asked.gyroscope or BASE, catalogue=asked.catalogue)
+
+    observations = HandResult.observations
+    needs_joints, on_table = False, None
+    needs_temperature = False   # no temperatures are kept with the poses
+
+    @property
+    def frame_id(self) -> str:
+        """Frame of the sensor; '' before the first message."""
+        imu = self._store.samples()
+        return '' if imu is None else imu.frame_id
+
+    def change_windows(self, windows: WindowSettings) -> None:
+        """Use other settings for the poses from now on, in all samples."""
+        self.options = replace(self.options, windows=windows)
+        self._search(self._store)
+
+    def change_by_hand(self, by_hand: LiveByHandSettings) -> None:
+        """Use another gravity, or keep another number of samples."""
+        self.options = by_hand.at_place(self.options)
+        self._store.most = by_hand.hand_samples
+
+    @property
+    def n_windows(self) -> int:
+        """Poses at the last search."""
+        return len(self.found.rests)
+
+    @property
+    def stamping(self) -> StampLine | None:
+        """Regularity of the IMU stamps (`stamping.StampLine`); None while unknown."""
+        return self._check.line
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Unusable samples, by reason."""
+        counts = dict(self._drops)
+        for reason, count in self._check.counts.items():
+            counts[f'imu {reason}'] = counts.get(f'imu {reason}', 0) + count
+        return {reason: count for reason, count in counts.items() if count}
+
+    def push(self, block: SampleBlock) -> list[ImuSamples]:
+        """Add arriving samples; return the poses completed since the last call, as mean ImuSamples, one each, in a list."""
+        for reason, count in (block.dropped or {}).items():
+            self._drops[reason] = self._drops.get(reason, 0) + count
+        imu = block.imu
+        if imu is None or not len(imu):
+            return []
+        imu = imu if self.options.nominal is None else self.options.nominal.apply(imu)
+        self._store.add(self._check.push(imu))
+        self._unsearched += len(imu)
+        period = self._check.statistics().period
+        if self._unsearched * period < SEARCH_STEP or not self._pacer.due(self._clock()):
+            return []
+        start, self._unsearched = self._clock(), 0
+        self._search(self._store)
+        if self._store.forget(self.found.rests, MOST_POSES):
+            self._search(self._store)
+        self._pacer.note(start, self._clock())
+        return self._newly_over()
+
+    def _search(self, store):
+        imu = store.samples()
+        if imu is not None and len(imu) > 2:
+            self.found = look_for_poses(imu, self.options.windows)
+
+    def _newly_over(self):
+        imu, found = self._store.samples(), self.found
+        over = found.rests if not found.resting else found.rests[:-1]
+        new = [k for k, rest in enumerate(over) if self._reported_ns is None or imu.stamp_ns[rest.start] > self._reported_ns]
+        if new:
+            self._reported_ns = int(imu.stamp_ns[over[new[-1]].stop - 1])
+        middle = [(found.rests[k].start + found.rests[k].stop) // 2 for k in new]
+        return [ImuSamples(self._store.true_stamps(imu.stamp_ns[[m]]), found.poses.force[[k]], found.poses.rate[[k]], imu.frame_id)
+                for k, m in zip(new, middle)]
+
+    def solve(self, pending: bool = False, provenance: dict | None = None) -> HandResult:
+        """
+        Solve the collected samples and return the HandResult, also stored in `result`.
+
+        Parameters
+        ----------
+        pending : bool
+            Include the last sample, which may prove to be a stray; the current rest is included in any case.
+        provenance : dict, optional
+            For the document.
+
+        Raises
+        ------
+        NotObservableError
+            With fewer than four different attitudes.
+        InputError
+            When the units are plainly wrong.
+
+        """
+        store = self._store
+        if pending:
+            store = store.copy()
+            store.add(copy.deepcopy(self._check).finish())
+        imu = store.samples()
+        if imu is None or len(imu) < 3:
+            raise NotObservableError(f'calibration by hand needs {POSES_LEAST} different attitudes at rest, no sample was received; '
+                                     'check the topic', code='no_samples')
+        self._search(store)
+        recording = HandRecording(imu, None, self.counts)
+        self.result = calibrate_samples_by_hand(recording, self.options, provenance, stills=self.found.rests)
+        return self.result
+
+    def needs_linearising(self) -> bool:
+        """Return False: the solution is iterated to its end."""
+        return False
+
+    def saved(self, pending: bool = False) -> bytes:
+        """Return the samples as bytes, for `saved` of another run."""
+        store = self._store.copy()
+        store.add(copy.deepcopy(self._check).finish())
+        return store.to_bytes()
+
+    def residuals(self, poses: Sequence[ImuSamples]) -> ImuSamples | None:
+        """
+        Return measured minus predicted of poses from `push`, as ImuSamples, or None before the first solution.
+
+        The direction of gravity in a pose is estimated, so only the length of the specific force can differ from its
+        prediction; the rate is compared with zero.
+        """
+        if self.result is None or not poses:
+            return None
+        mean, hand = ImuSamples.concatenate(poses), self.result.hand
+        time = 1e-9 * (mean.stamp_ns - self.result.gathered.first_stamp_ns)
+        true, turning = hand.compensate(mean.force_s, mean.rate_s, time)
+        gravity_s = true * (hand.gravity / np.linalg.norm(true, axis=1))[:, None]
+        return ImuSamples(mean.stamp_ns, (true - gravity_s) @ hand.accelerometer[1].T, turning @ hand.gyroscope[1].T, mean.frame_id)
+
+    def groups(self) -> list[GroupState]:
+        """Return the GroupState of every effect."""
+        if self.result is None:
+            return [replace(group, needs=_FIRST_NEEDS[group.sensor]) for group in waiting_groups(self.model)]
+        return group_states(self.result)
+
+    def coverage(self) -> Coverage:
+        """Return the Coverage: useful attitudes, and the next one."""
+        known = (self.found, self.result, self.options.gravity)
+        if self._shown is None or any(a is not b for a, b in zip(known, self._shown[0], strict=True)):
+            self._shown = known, hand_coverage(self.found, self.result, hand_options(self.options), frame_id=self.frame_id)
+        return self._shown[1]
+
+    def status(self, hints: dict[str, str] | None = None) -> SessionStatus:
+        """Return the SessionStatus: progress, and the pose or turn with the largest gain; `hints` as for `errors.with_hint`."""
+        status = hand_status(self.found, self.result.calibration if self.result else None,
+                             step=self.coverage().next.text, hints=hints)
+        return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
+
+
+def _check_model(model):
+    """Refuse effects that need a table, and effects of temperature: a live session stores no temperatures with the poses."""
+    thermal = [effect.name for effect in model.effects if 'temperature' in effect.needs]
+    if thermal:
+        raise InputError(f"{', '.join(thermal)} must be estimated by hand from a recording, live no temperatures are kept; "
+                         "record a bag and run 'imu_calibration calibrate BAG', or omit it", code='offline_only')
+    HandModel(model, STANDARD_GRAVITY)

@@ -1,0 +1,113 @@
+"""Progress of a calibration by hand: poses, attitudes and turns so far, and the missing direction or motion."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.calibration.effect_states import Progress
+from imu_calibration.calibration.session import SessionStatus
+from imu_calibration.core.errors import with_hint
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.estimation.status import COMMON_SCALE, LACKING
+from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.preprocessing.window import WindowSettings
+from imu_calibration.references.gravity.equations import Poses
+from imu_calibration.references.gravity.hand_calibration import POSES_FULL, POSES_LEAST
+from imu_calibration.references.gravity.hand_options import ByHandSettings
+from imu_calibration.references.gravity.poses import average_poses, distinct_attitudes
+from imu_calibration.references.gravity.turns import collect_turns
+
+FACES = {f'{sign}{axis}': direction for axis, unit in zip('xyz', np.eye(3)) for sign, direction in (('+', unit), ('-', -unit))}
+"""The six directions that can be turned up."""
+SEEN = np.pi / 4
+"""A face counts as seen when an attitude lies within this angle of it, rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """Result of the search for rest in the samples so far."""
+
+    rests: list
+    """Ranges at rest (slice)."""
+    poses: Poses | None
+    """Their means; None without any rest."""
+    attitudes: int
+    """Number of different attitudes."""
+    turns: int
+    """Number of usable turns between consecutive poses."""
+    dropped: dict
+    """Reason -> number of unusable turns."""
+    resting: float
+    """Duration of the current rest, s; 0 in motion."""
+
+
+NOTHING = Findings([], None, 0, 0, {}, 0.0)
+
+
+def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> Findings:
+    """Return the Findings in ImuSamples with rising stamps."""
+    rests = [rest for rest in find_still(imu, windows) if rest.stop - rest.start >= 2]
+    if not rests:
+        return NOTHING
+    settings, seconds = ByHandSettings(), 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
+    poses = average_poses(imu, [(rest.start, rest.stop) for rest in rests])
+    turns, dropped = collect_turns(seconds, imu, poses=poses, settings=settings)
+    goes_on = seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1
+    resting = float(seconds[-1] - seconds[rests[-1].start]) if goes_on else 0.0
+    return Findings(rests, poses, distinct_attitudes(poses.force, settings.pose_apart), len(turns), dropped, resting)
+
+
+def hand_status(found: Findings, calibration: Calibration | None, *, step: str,
+                hints: dict[str, str] | None = None) -> SessionStatus:
+    """
+    Return the SessionStatus.
+
+    Parameters
+    ----------
+    found : Findings
+    calibration : Calibration or None
+        The last solution.
+    step : str
+        Next step in the planner's text (`advice`), '' when no pose has a gain.
+    hints : dict, optional
+        As for `errors.with_hint`.
+
+    """
+    not_seen = unseen(found)
+    word, needs = _needs(found, not_seen, calibration, step=step, hints=hints or {})
+    values = {'poses': len(found.rests), 'attitudes': found.attitudes, 'turns': found.turns,
+              **{f'turns left out: {reason}': count for reason, count in found.dropped.items()},
+              'directions of gravity not seen': ' '.join(not_seen), 'at rest for [s]': f'{found.resting:.1f}', 'next': '; '.join(needs)}
+    parts = [f'{_plural(len(found.rests), "pose")} in {_plural(found.attitudes, "attitude")}, {_plural(found.turns, "turn")}']
+    if found.dropped:
+        parts.append('turns left out: ' + ', '.join(f'{count} {reason}' for reason, count in sorted(found.dropped.items())))
+    if found.resting:
+        parts.append(f'at rest for {found.resting:.1f} s: this pose counts, move on')
+    parts += [f'next: {need}' for need in needs] if needs else ['all parameters are determined: save the calibration']
+    return SessionStatus(word, '; '.join(parts), values)
+
+
+def unseen(found: Findings) -> list[str]:
+    """Return the faces ('+x', ...) that have not been up, the one furthest from all attitudes first."""
+    if found.poses is None:
+        return list(FACES)
+    up = found.poses.force / np.linalg.norm(found.poses.force, axis=1, keepdims=True)
+    nearest = {name: float(np.arccos(np.clip(up @ face, -1, 1)).min()) for name, face in FACES.items()}
+    return sorted((name for name, angle in nearest.items() if angle > SEEN), key=lambda name: -nearest[name])
+
+
+def _needs(found, not_seen, calibration, *, step, hints):
+    if found.attitudes < POSES_LEAST or calibration is None:
+        more = f' (faces not seen yet: {", ".join(not_seen)})' if not_seen else ''
+        return Progress.WAITING, [f'{step}{more}; {POSES_LEAST} attitudes at least, {POSES_FULL} for all parameters']
+    lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
+    if not lacking:
+        return Progress.DETERMINED, []
+    if lacking == [COMMON_SCALE]:
+        return Progress.WEAK, [with_hint('give the local gravity, which scales the accelerometer as a whole', 'gravity', hints)]
+    return Progress.WEAK, [step] if step else list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
+
+
+def _plural(count, noun):
+    return f'{count} {noun}' + ('' if count == 1 else 's')

@@ -1,0 +1,183 @@
+"""Use cases as plain functions: the command line, the nodes and the tests call the same ones."""
+
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from imu_calibration.calibration import accumulator_state
+from imu_calibration.calibration.collector import GatherStep
+from imu_calibration.calibration.from_solution import document, motions_needed, with_gravity_uncertainty, with_weak_replaced
+from imu_calibration.calibration.model_changes import ModelChanges
+from imu_calibration.calibration.proof import prove_solution
+from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.core.progress import report
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.uncorrected import LAST_SHARE, end_of, uncorrected_on_table
+from imu_calibration.effects.applied import in_time, not_applied
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.accumulator import restrict
+from imu_calibration.estimation.solution import Solution, shrunk
+from imu_calibration.estimation.solver import solve
+from imu_calibration.estimation.status import tolerances_of
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.joint_checks import check_units
+from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
+from imu_calibration.references.turntable.gathered import Gathered, join
+from imu_calibration.selection.linearisation import PASSES, at_time_constants, linearise_again
+
+
+def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
+              provenance: dict | None = None, progress: Callable | None = None, mapper: Callable = map,
+              names: Sequence[str] | None = None) -> TableResult:
+    """
+    Calibrate from one or several recordings of the same IMU on a table.
+
+    Parameters
+    ----------
+    sources : sequence of callables
+        Each returns an iterator of SampleBlock when called; called again when effects must be linearised again.
+    table : Table
+        The reference.
+    options : CalibrationOptions
+    provenance : dict, optional
+        Bag names, hashes and options for the document.
+    progress : callable, optional
+        Called with the number of IMU samples read.
+    mapper : callable
+        Applies the map step to the recordings; `map`, or the `map` of a pool.
+    names : sequence of str, optional
+        Names of the recordings for messages.
+
+    Returns
+    -------
+    TableResult
+
+    Raises
+    ------
+    InputError
+        When a recording cannot be used or is of another frame, with its name when there are several.
+
+    """
+    return conclude(*solve_recordings(sources, table, options, progress=progress, mapper=mapper, names=names), table=table, options=options,
+                    provenance=provenance)
+
+
+def solve_recordings(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
+                     progress: Callable | None = None, mapper: Callable = map, names: Sequence[str] | None = None,
+                     keep_windows: bool = False) -> tuple[Solution, Gathered, SensorModel]:
+    """
+    Return (Solution, Gathered, SensorModel of the gathered columns) of recordings; arguments as in `calibrate`.
+
+    keep_windows : bool
+        Whether windows are kept for the search of effects (`by_evidence`).
+    """
+    names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
+    model = choose_model(options, table)
+    if model.needs_temperature:
+        model = model.with_reference_temperature(_first_temperature(sources))
+
+    def solved(model, judged_from):
+        step = GatherStep(table, model, options.windows, options.nominal, names, keep_windows, progress, judged_from)
+        gathered = join(list(mapper(step, enumerate(sources))), names, partial(check_units, model=model, table=table))
+        report('solving')
+        return solve_gathered(gathered, model, options), gathered
+
+    again, judged_from = _at_time_constants(model, options, lambda trial: solved(trial, 0.0)), 0.0
+    for _ in range(PASSES):
+        model = again
+        solution, gathered = solved(model, judged_from)
+        again, last_third = linearise_again(model, solution), judged_from_of(solution.model, gathered)
+        if again is None and judged_from == last_third:
+            break
+        again, judged_from = again or model, last_third
+    return solution, gathered, model
+
+
+def _at_time_constants(model, options, solved):
+    """
+    Return the model with the columns of requested warm-ups at the time constant with the smallest residuals of window means.
+
+    The iteration from the prior does not converge to a time constant that is several times shorter.
+    """
+    for effect in model.effects:
+        if effect.time_constant and effect.name not in options.point:
+            duration = end_of(solved(model)[1].accumulator)
+            model = min(at_time_constants(model, effect, duration), key=lambda trial: solved(trial)[0].residual_rms[effect.sensor][1])
+    return model
+
+
+def judged_from_of(model: SensorModel, gathered: Gathered) -> float:
+    """Return the time from which windows are judged, s: that of the last third of the recording where the model has effects in time."""
+    return LAST_SHARE * end_of(gathered.accumulator) if any(map(in_time, not_applied(model))) else 0.0
+
+
+def _first_temperature(sources):
+    """Return the first temperature of the first recording."""
+    for block in sources[0]():
+        if block.temperature is not None and len(block.temperature):
+            return float(block.temperature.temperature_c[0])
+    raise InputError('a thermal effect needs temperatures, the recording has none; record imu/temperature or omit the effect')
+
+
+def solve_gathered(gathered: Gathered, model: SensorModel, options: CalibrationOptions = CalibrationOptions()) -> Solution:
+    """Return the Solution of gathered data with the columns of `model` for the requested effects: the reduce step."""
+    narrow = settle_model(model, options, gathered)
+    accumulator = gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
+    solution = solve(accumulator, narrow, bias_processes=options.bias_processes)
+    if options.accelerometer_model is None and _size_effect_unseen(solution):
+        smaller = narrow.without_arms()
+        solution = solve(restrict(accumulator, narrow, smaller), smaller, bias_processes=options.bias_processes)
+    return shrunk(solution, _by_default(solution.model, options))
+
+
+def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions = CalibrationOptions()) -> Calibration:
+    """
+    Return the calibration of a saved live session (`accumulator_state`), with the model of its columns and the added effects.
+
+    Raises
+    ------
+    DocumentError
+        When it is damaged, or was gathered with different joints.
+    NotObservableError
+        When no parameter is determined.
+
+    """
+    model = accumulator_state.saved_model(data)
+    if model.joint_names != table.joint_names:
+        raise DocumentError(f"a saved accumulator must be of the joints {', '.join(table.joint_names)}, "
+                            f"this is of {', '.join(model.joint_names) or 'none'}; "
+                            'give the table or the arm that it was gathered on', key='table')
+    gathered = accumulator_state.from_bytes(data, model)
+    demand = accumulator_state.saved_demand(data)
+    options = demand.options(options)
+    return conclude(demand.applied(solve_gathered(gathered, model, options)), gathered, model, table=table, options=options,
+                    changes=demand.changes).calibration
+
+
+def conclude(solution: Solution, gathered: Gathered, model: SensorModel, *, table: Table,
+             options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None,
+             changes: ModelChanges = ModelChanges()) -> TableResult:
+    """Judge a solution of data gathered with `model`, name the missing motions, and return the TableResult."""
+    tolerances = tolerances_of(solution.model, options.tolerances)
+    solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
+    needed = motions_needed(solution, tolerances, table)
+    uncorrected = uncorrected_on_table(solution.model.at(solution.values), solution.values, gathered.accumulator, gathered=model)
+    proof = prove_solution(gathered.held_out, solution, model, centre=uncorrected.centre)
+    calibration = document(solution, tolerances, table, gathered=gathered, needed=needed, provenance=provenance, proof=proof,
+                           changes=changes, uncorrected=uncorrected)
+    return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options, solution=solution,
+                       table=table, model=solution.model, gathered_model=model)
+
+
+def _by_default(model, options):
+    """Return the parameters of each effect that is in the model unasked: levelling, the Earth's rate, arms of the accelerometers."""
+    arms = options.accelerometer_model is None
+    return [model.slices[effect.key] for effect in model.effects if effect.role is Role.ARMS and arms
+            or effect.sensor == 'reference' and effect.nuisance and options.reference_model is None and effect.key not in options.added]
+
+
+def _size_effect_unseen(solution):
+    arms, arm = (solution.held[solution.model.part('accelerometer', role)] for role in (Role.ARMS, Role.ARM))
+    return len(arms) > 0 and bool(arms.all() and arm.all())   # an arm that is seen would bias the bias if left out

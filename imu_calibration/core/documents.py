@@ -1,0 +1,158 @@
+"""Documents as YAML text: the calibration, the table, tolerances. The same content gives the same bytes."""
+
+import math
+import re
+from enum import StrEnum
+from functools import cache
+from typing import Any
+
+from imu_calibration.core.errors import InputError, shortened
+
+LARGEST = 2_000_000
+"""Largest number of characters of a document; the covariance of a hundred parameters has 300 000."""
+MOST_PARTS = 60_000
+"""Largest number of numbers, texts, lists and mappings in a document: they are read in half a second."""
+LONGEST = 5000
+"""Largest number of characters of one text or number; the time of a number in base sixty grows with the square of its length."""
+NO_SUCH_VALUE = (ValueError, OverflowError, TypeError, AttributeError)
+"""Exceptions of the parser for malformed dates and numbers."""
+NUMBER, LONGEST_NUMBER = re.compile(r'[-+0-9][0-9_:.a-fxA-F+-]*'), 100
+"""Start of a number, and its largest number of characters; larger integers do not fit into a float."""
+FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]{1,3}$')
+"""Numbers such as 1e-6 and 1.5e3: the rules of YAML 1.1 require a point and a sign of the exponent; YAML 1.2, ROS and JSON do not."""
+DEEPEST = 20
+"""Deepest nesting of lists and mappings; the stack of a recursive parser overflows well above it."""
+
+
+def finite(value: float) -> float | None:
+    """Return a float, or None for an infinite value or NaN, which documents do not contain."""
+    return float(value) if math.isfinite(value) else None
+
+
+def to_text(document: dict[str, Any]) -> str:
+    """
+    Return a mapping as YAML: block style for mappings, lists of numbers on one line each.
+
+    Parameters
+    ----------
+    document : dict
+        Plain dicts, lists, strings and numbers.
+
+    """
+    import yaml
+
+    base: Any = _with_floats('SafeDumper')
+
+    class Dumper(base):
+        """Writes lists of scalars on one line and floats with all their digits."""
+
+        def ignore_aliases(self, _data):
+            return True
+
+    def sequence(dumper, items):
+        flat = all(not isinstance(item, (dict, list, tuple)) for item in items)
+        return dumper.represent_sequence('tag:yaml.org,2002:seq', items, flow_style=flat)
+
+    Dumper.add_representer(list, sequence)
+    Dumper.add_representer(tuple, sequence)
+    Dumper.add_multi_representer(StrEnum, lambda dumper, word: dumper.represent_str(word.value))
+    return yaml.dump(document, Dumper=Dumper, sort_keys=False, width=100_000, allow_unicode=True)
+
+
+@cache
+def _with_floats(name: str) -> Any:
+    """Return PyYAML's reader or writer of that name, in C where available, with `FLOAT`: a text that resembles a number is then quoted."""
+    import yaml
+    kind: Any = type(name, (getattr(yaml, f'C{name}', getattr(yaml, name)),), {})
+    kind.add_implicit_resolver('tag:yaml.org,2002:float', FLOAT, list('-+.0123456789'))
+    return kind
+
+
+def from_text(text: str, what: str = 'document') -> dict[str, Any]:
+    """Return the mapping in a YAML text; raises as `parsed`, also when it is not a mapping."""
+    document = parsed(text, what)
+    if not isinstance(document, dict):
+        raise InputError(f'a {what} must be a mapping, got {type(document).__name__}; correct the file', code='not_a_mapping')
+    return document
+
+
+def parsed(text: str, what: str, aliases: bool = False) -> Any:
+    """
+    Return the content of a YAML text.
+
+    Parameters
+    ----------
+    text : str
+    what : str
+        Name of the document in errors.
+    aliases : bool
+        Whether a part may refer to an earlier one, as recorders write it.
+
+    Raises
+    ------
+    InputError
+        When the text is not YAML, is too large or too deep, repeats a key or is built on aliases; a text of a few lines could otherwise
+        exhaust the memory.
+
+    """
+    import yaml
+    loader = _with_floats('SafeLoader')
+    _within_limits(len(text), LARGEST, what, 'characters')
+    try:
+        _look_through(yaml.parse(text, Loader=loader), what, aliases)
+        return yaml.load(text, Loader=loader)
+    except (yaml.YAMLError, *NO_SUCH_VALUE) as error:
+        raise InputError(f'a {what} must be YAML, this is not: {shortened(str(error), 500)}; correct the file', code='not_yaml') from error
+
+
+def _look_through(events, what, aliases):
+    """Refuse documents that need much time or memory, from the events of the parser, which need neither."""
+    count, sizes, open_parts = 0, {}, []   # parts with aliases expanded; those of each anchor; [anchor, count, keys or None, key is next]
+    for event in events:
+        kind = type(event).__name__
+        if kind.endswith(('StreamStartEvent', 'DocumentStartEvent', 'StreamEndEvent', 'DocumentEndEvent')):
+            continue
+        if kind.endswith('EndEvent'):
+            anchor, start, *_ = open_parts.pop()
+            sizes[anchor] = count - start
+            continue
+        if kind == 'AliasEvent' and not (aliases and event.anchor in sizes):
+            raise InputError(f'a {what} must not use aliases, this document has YAML aliases (*{event.anchor}); write it without',
+                             code='yaml_alias')
+        if open_parts and open_parts[-1][2] is not None:
+            _check_key(event, open_parts[-1], what)
+        count += sizes[event.anchor] if kind == 'AliasEvent' else 1
+        if kind == 'ScalarEvent':
+            sizes[event.anchor] = 1
+            if event.implicit[0] or event.tag:   # false for a quoted text
+                _within_limits(len(event.value), LONGEST, what, 'characters in a row')
+                if NUMBER.fullmatch(event.value):
+                    _within_limits(len(event.value), LONGEST_NUMBER, what, 'characters in a number')
+        elif kind != 'AliasEvent':
+            open_parts.append([event.anchor, count, set() if kind == 'MappingStartEvent' else None, True])
+        _within_limits(len(open_parts), DEEPEST, what, 'levels')
+        _within_limits(count, MOST_PARTS, what, 'parts')
+
+
+def _check_key(event, mapping, what):
+    """Refuse a key that the open mapping has already, and one that merges another mapping into it."""
+    mapping[3] = not mapping[3]
+    if mapping[3]:   # this is a value
+        return
+    key = getattr(event, 'value', None)
+    if key in mapping[2] or (key == '<<' and event.implicit[0]):
+        raise InputError(f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line '
+                         f'{event.start_mark.line + 1}; remove it', code='key_repeated')
+    mapping[2].update([key] if key is not None else [])
+
+
+def _within_limits(number, limit, what, unit):
+    if number > limit:
+        raise InputError(f'a {what} must not have more than {limit} {unit}, this one has more; is it the right file?',
+                         code='document_limit')
+
+
+def version_of(text: str) -> str:
+    """Return twelve characters that change whenever a document does: the beginning of its SHA-256."""
+    from hashlib import sha256
+    return sha256(text.encode()).hexdigest()[:12]

@@ -1,0 +1,190 @@
+"""Arrays of samples from a bag or a topic, independent of messages and files."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from imu_calibration.core.errors import InputError
+
+FIRST_NS = 1_000_000_000
+"""Stamp of the first sample where times do not count from an epoch: a stamp of zero means unset in ROS."""
+EPOCH = 1e8
+"""s; larger times count from 1970."""
+
+
+def stamps_of(time: np.ndarray, unit: float = 1.0) -> np.ndarray:
+    """
+    Return stamps of times in multiples of `unit` seconds, ns, int64, shape (n,).
+
+    Times that do not count from 1970 are shifted, so that the first stamp is `FIRST_NS`.
+    """
+    start = round(time[0] * unit * 1e9) if time[0] * unit > EPOCH else FIRST_NS
+    return start + np.round((time - time[0]) * (unit * 1e9)).astype(np.int64)
+
+
+class _Columns:
+    """Slicing and joining for dataclasses whose array fields share their first axis."""
+
+    def __len__(self):
+        return len(self.stamp_ns)
+
+    def select(self, index):
+        """Return the samples at `index` (slice, mask or integer array)."""
+        return type(self)(**{f.name: _pick(getattr(self, f.name), index) for f in fields(self)})
+
+    @classmethod
+    def concatenate(cls, parts):
+        """Join `parts` in order; fields that are not arrays are those of the first part."""
+        parts = list(parts)
+        return cls(**{f.name: _join([getattr(part, f.name) for part in parts]) for f in fields(cls)})
+
+
+def _pick(value, index):
+    return value[index] if isinstance(value, np.ndarray) else value
+
+
+def _join(values):
+    return np.concatenate(values) if isinstance(values[0], np.ndarray) else values[0]
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSamples(_Columns):
+    """Readings of one IMU in the order of arrival."""
+
+    stamp_ns: np.ndarray
+    """Header stamps, int64, shape (n,)."""
+    force_s: np.ndarray
+    """Specific force in the sensor frame, m/s^2, shape (n, 3)."""
+    rate_s: np.ndarray
+    """Angular rate in the sensor frame, rad/s, shape (n, 3)."""
+    frame_id: str = ''
+    """Frame of the first message."""
+    corrected: np.ndarray | None = None
+    """Corrected specific force and rate that belong to the readings, shape (n, 6), where a calibration is checked."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointSamples(_Columns):
+    """Joint states brought to one order of names."""
+
+    stamp_ns: np.ndarray
+    """Header stamps, int64, shape (n,)."""
+    position: np.ndarray
+    """Joint angles, rad, shape (n, n_joints)."""
+    velocity: np.ndarray
+    """Joint rates, rad/s, shape (n, n_joints); NaN where the message had none."""
+    names: tuple = ()
+    """Joint names in column order."""
+
+    @classmethod
+    def of_angles(cls, stamp_ns: np.ndarray, angles: dict[str, np.ndarray]) -> 'JointSamples':
+        """Return the samples of joint angles by name, rad, each of shape (n,); without velocities."""
+        position = np.column_stack(list(angles.values()))
+        return cls(stamp_ns, position, np.full(position.shape, np.nan), tuple(angles))
+
+
+@dataclass(frozen=True, eq=False)
+class TemperatureSamples(_Columns):
+    """Temperature near the sensor."""
+
+    stamp_ns: np.ndarray
+    """Header stamps, int64, shape (n,)."""
+    temperature_c: np.ndarray
+    """Temperature, degrees Celsius, shape (n,)."""
+    branch: np.ndarray | None = None
+    """Thermal branch (`kinematics.signal_history`), in [-1, 1], shape (n,); None if not computed."""
+
+
+@dataclass(frozen=True, eq=False)
+class SampleBlock:
+    """A stretch of a recording, or the messages received since the last call."""
+
+    imu: ImuSamples | None = None
+    """IMU samples, or None when the block has none."""
+    joints: JointSamples | None = None
+    """Joint samples, or None."""
+    temperature: TemperatureSamples | None = None
+    """Temperature samples, or None."""
+    dropped: dict | None = None
+    """Messages that could not be turned into samples: reason -> count."""
+    notes: dict | None = None
+    """Messages that were changed before use, such as messages without a stamp: reason -> count."""
+
+    @classmethod
+    def from_arrays(cls, time: ArrayLike, force: ArrayLike, rate: ArrayLike, *, joints: dict[str, ArrayLike] | None = None,
+                    temperature_c: ArrayLike | None = None) -> 'SampleBlock':
+        """
+        Return a recording from arrays.
+
+        Parameters
+        ----------
+        time : array_like
+            Seconds, from an epoch or relative, shape (n,).
+        force : array_like
+            Specific force in the sensor frame, m/s^2; at rest, z up, +g about z; shape (n, 3).
+        rate : array_like
+            Angular rate in the sensor frame, rad/s, shape (n, 3).
+        joints : dict, optional
+            Joint name -> angles at the same times, rad, shape (n,).
+        temperature_c : array_like, optional
+            Degrees Celsius, shape (n,).
+
+        Raises
+        ------
+        InputError
+            When shapes differ or a time is not finite.
+
+        """
+        time, force, rate = (np.asarray(values, float) for values in (time, force, rate))
+        angles = {name: np.asarray(values, float) for name, values in (joints or {}).items()}
+        heat = None if temperature_c is None else np.asarray(temperature_c, float)
+        n = len(time) if time.ndim == 1 else -1
+        given = {'time': time, 'force': force, 'rate': rate, **angles, **({} if heat is None else {'temperature_c': heat})}
+        for name, values in given.items():
+            wanted = (n, 3) if name in ('force', 'rate') else (n,)
+            if values.shape != wanted or n < 2:
+                raise InputError(f'{name} must have shape {str(wanted).replace("-1", "n")} with at least 2 rows, got {values.shape}; '
+                                 'correct the array')
+        if not np.isfinite(time).all():
+            raise InputError(f'every time must be finite, got {np.count_nonzero(~np.isfinite(time))} that are not; remove these rows')
+        stamp_ns = stamps_of(time)
+        return cls(ImuSamples(stamp_ns, force, rate, 'imu_link'), JointSamples.of_angles(stamp_ns, angles) if angles else None,
+                   None if heat is None else TemperatureSamples(stamp_ns, heat))
+
+
+@dataclass(frozen=True)
+class NominalScaling:
+    """Nominal conversion of volts or counts to SI: ``SI = (reading - offset) / scale``."""
+
+    accelerometer_offset: float = 0.0
+    """Reading at zero specific force."""
+    accelerometer_scale: float = 1.0
+    """Reading per m/s^2."""
+    gyroscope_offset: float = 0.0
+    """Reading at zero rate."""
+    gyroscope_scale: float = 1.0
+    """Reading per rad/s."""
+
+    def apply(self, imu: ImuSamples) -> ImuSamples:
+        """Return the samples in SI."""
+        return replace(imu, force_s=(imu.force_s - self.accelerometer_offset) / self.accelerometer_scale,
+                       rate_s=(imu.rate_s - self.gyroscope_offset) / self.gyroscope_scale)
+
+
+def runs_of(flags: ArrayLike) -> np.ndarray:
+    """Return (start, stop) of each run of true flags, half open, shape (n_runs, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], np.asarray(flags, bool), [False]]))).reshape(-1, 2)
+
+
+def smallest_step(readings: np.ndarray, least: float = 1e-9) -> np.ndarray:
+    """Return the smallest step from one reading to the next in each column, (n, k), above the share `least` of the largest, shape (k,)."""
+    step = np.abs(np.diff(readings, axis=0))
+    real = step > least * np.maximum(np.abs(readings).max(axis=0, initial=0.0), 1e-12)
+    return np.min(np.where(real, step, np.inf), axis=0, initial=np.inf)
+
+
+def rounding_variance(readings: np.ndarray) -> np.ndarray:
+    """Return the variance of rounding, ``step^2 / 12`` of the smallest step, of each column, shape (k,); 0 where none changes."""
+    step = smallest_step(readings, 1e-12)
+    return np.where(np.isfinite(step), step, 0.0)**2 / 12

@@ -1,0 +1,76 @@
+"""Every adjustable number, declared once: YAML files, options and ROS parameters are made from here."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from imu_calibration.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One field of a settings dataclass, as it was declared."""
+
+    name: str
+    """Name of the field, the option and the parameter."""
+    default: Any
+    """Its type is the setting's."""
+    unit: str
+    """'' or '1' without one."""
+    text: str
+    """Meaning."""
+    bounds: tuple
+    """(smallest, largest) value; None: no end."""
+    symptom: str
+    """Symptoms of a wrong value."""
+    live: bool
+    """Whether a change applies to a running session."""
+    fixed: str
+    """Why not, when it does not."""
+    session: bool
+    """Whether it names an input of a session: settings files omit it, because they would override earlier options."""
+    path: bool
+    """Whether it is the path of a file; such a ROS parameter is read-only, because any participant can set writable ones."""
+
+
+def setting(default: Any, unit: str, text: str, bounds: tuple = (None, None), symptom: str = '', *, live: bool = False,
+            fixed: str = 'it is read at the start', session: bool = False, path: bool = False) -> Any:
+    """Declare one field of a settings dataclass; arguments as in `Setting`."""
+    return field(default=default, metadata={'unit': unit, 'text': text, 'bounds': bounds, 'symptom': symptom, 'live': live, 'fixed': fixed,
+                                            'session': session, 'path': path})
+
+
+def describe(group: Any) -> list[Setting]:
+    """Return the Setting of each field of a settings class or instance."""
+    return [Setting(f.name, f.default, **f.metadata) for f in fields(group)]
+
+
+def override(group: Any, values: Mapping[str, Any]) -> Any:
+    """
+    Return a copy of the settings `group` with `values` (name -> value) set.
+
+    Raises
+    ------
+    InputError
+        When a name is unknown, a type does not fit or a value is out of bounds.
+
+    """
+    known = {f.name: f for f in fields(group)}
+    checked = {}
+    for name, value in values.items():
+        if name not in known:
+            raise InputError(f"setting '{name}' is unknown; the settings here are {', '.join(sorted(known))}")
+        checked[name] = _checked(known[name], value)
+    return replace(group, **checked)
+
+
+def _checked(declared, value):
+    default, (low, high) = declared.default, declared.metadata['bounds']
+    if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if default is not None and not isinstance(value, type(default)):
+        raise InputError(f"setting '{declared.name}' must be {type(default).__name__}, got {value!r}; correct it")
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        if (low is not None and value < low) or (high is not None and value > high):
+            raise InputError(f"setting '{declared.name}' must lie in [{low}, {high}], got {value!r}; choose a value inside")
+    return value

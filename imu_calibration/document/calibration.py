@@ -1,0 +1,223 @@
+"""The calibration of an IMU, estimated from recordings, as a document that users and nodes exchange."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.units import for_people, with_sd
+from imu_calibration.document.decision import SensorDecision, decide, decisions_text, most_cautious
+from imu_calibration.document.statements import Verdict
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.covariance_terms import GRAVITY
+from imu_calibration.estimation.status import COMMON_SCALE, FIXED, LACKING, Status
+
+UNKNOWN = 'unknown'
+"""Entry of the provenance for the uncertainty of imported values."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Parameters with covariance and status, and the conditions under which they were found."""
+
+    model: SensorModel
+    """Effects and their order."""
+    values: np.ndarray
+    """Parameters in ``model.param_names`` order, SI, shape (n_params,)."""
+    covariance: np.ndarray
+    """Covariance of the values, shape (n_params, n_params)."""
+    status: tuple
+    """'determined', 'weak' or 'held' for each parameter."""
+    frame_id: str = ''
+    """Sensor frame."""
+    gauge: dict = field(default_factory=dict)
+    """Origin of the arms and the sensor axes, by convention."""
+    undetermined: tuple = ()
+    """Weak directions: {'parameters': {name: weight}, 'needs': motion}."""
+    statistics: dict = field(default_factory=dict)
+    """Residual rms, noise, chi-square, windows, samples dropped."""
+    conditions: dict = field(default_factory=dict)
+    """Temperature range, largest rate, gravity, duration, date."""
+    provenance: dict = field(default_factory=dict)
+    """Software version, bag names and hashes, options."""
+    decision: dict[str, str] = field(default_factory=dict)
+    """Sensor -> decision in the file (`decision.SensorDecision`); see `decisions` for a sensor without one."""
+    decision_reasons: dict[str, str] = field(default_factory=dict)
+    """Sensor -> the reason for the decision."""
+    notes: tuple = ()
+    """Parameters within tolerance, warnings, notes and next steps, a line each."""
+    proof: dict = field(default_factory=dict)
+    """
+    Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on held-out data; {}: never measured.
+    """
+    covariance_terms: dict[str, np.ndarray] = field(default_factory=dict)
+    """Term (`estimation.covariance_terms`) -> its variance of each parameter, shape (n_params,); the sum is that of `covariance`."""
+    held_reason: dict[str, str] = field(default_factory=dict)
+    """Held parameter -> the reason (`status.reasons_held`)."""
+    judgement: Verdict | None = None
+    """The verdict with its reasons one by one, where it was not read from a file."""
+
+    @property
+    def param_names(self) -> list[str]:
+        """Names in the order of `values`."""
+        return self.model.param_names
+
+    @property
+    def sd(self) -> np.ndarray:
+        """Standard deviations, shape (n_params,)."""
+        return np.sqrt(np.clip(np.diag(self.covariance), 0, None))
+
+    @property
+    def common_scale(self) -> dict:
+        """{'sd', 'tolerance', 'status'} of the accelerometer's common scale by hand, {} where gravity counts as exact."""
+        return self.statistics.get('by_hand', {}).get('common_scale', {})
+
+    @property
+    def own_sd(self) -> np.ndarray:
+        """Standard deviations without `common_scale`, relative to which the other parameters are judged, shape (n_params,)."""
+        common = self.covariance_terms.get(GRAVITY, 0.0) if self.common_scale else 0.0
+        return np.sqrt(np.clip(np.diag(self.covariance) - common, 0, None))
+
+    @property
+    def status_by_name(self) -> dict[str, str]:
+        """Status of each parameter and of the common scale, by name."""
+        common = {COMMON_SCALE: self.common_scale['status']} if self.common_scale else {}
+        return dict(zip(self.param_names, self.status)) | common
+
+    def value(self, sensor: str, effect: str) -> np.ndarray:
+        """Return the value of one effect in its documented shape."""
+        found = self.model.catalogue.find(sensor, effect, self.model.joint_names)
+        return self.values[self.model.slices[sensor, effect]].reshape(found.shape)
+
+    def of(self, sensor: str, role: Role) -> Any:
+        """Return the value of the effect in a place of a sensor's equation (`effects.base.Role`) in its documented shape, or None."""
+        return self.model.value(sensor, role, self.values)
+
+    def has(self, sensor: str, effect: str) -> bool:
+        """Return whether the model contains the effect."""
+        return (sensor, effect) in self.model.slices
+
+    @property
+    def knows_density(self) -> bool:
+        """Whether the noise is known at any sampling rate."""
+        return 'noise_density' in self.statistics.get('accelerometer', {})
+
+    def noise(self, sensor: str, period: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return (standard deviation of a sample, sd of window offsets and wander), each shape (3,), from the statistics.
+
+        With a noise density and a `period` (s), the sample sd is for that rate; else for the rate of the recording.
+        """
+        found = self.statistics.get(sensor, {})
+        white = np.asarray(found.get('noise_sd', [0.0] * 3), float)
+        if period is not None and 'noise_density' in found:
+            white = np.asarray(found['noise_density'], float) / np.sqrt(period)
+        return white, np.hypot(float(found.get('between_window_sd', 0.0)), float(found.get('wander_sd', 0.0)))
+
+    @property
+    def uncertainty_known(self) -> bool:
+        """Whether the uncertainty of the values is known; that of imported values is not."""
+        return self.provenance.get('uncertainty') != UNKNOWN
+
+    @property
+    def decisions(self) -> dict[str, SensorDecision]:
+        """Sensor -> decision: the more cautious of that in the file and that of the proof; UNPROVEN without both."""
+        found = {}
+        for sensor in SENSORS:
+            known = [SensorDecision(self.decision[sensor])] if sensor in self.decision else []
+            found[sensor] = most_cautious([*known, decide(self.proof.get(sensor))] if self.proof.get(sensor) or not known else known)
+        return found
+
+    @property
+    def requested(self) -> dict[str, str]:
+        """Status of the requested parameters and of the common scale, by name; table, clock and the common arm are nuisances."""
+        nuisances = set(np.array(self.param_names)[~self.model.requested])
+        return {name: status for name, status in self.status_by_name.items() if name not in nuisances and status != FIXED}
+
+    def all_determined(self) -> bool:
+        """Return whether every parameter is determined."""
+        return not set(LACKING) & set(self.status_by_name.values())
+
+    def compensate(self, samples: ImuSamples | np.ndarray, rate_s: np.ndarray | None = None, *, time: np.ndarray | None = None,
+                   temperature_c: Any = None) -> ImuSamples | tuple[np.ndarray, np.ndarray]:
+        """
+        Return readings with the calibrated errors removed; see `compensation.arrays.compensate_readings`.
+
+        Parameters
+        ----------
+        samples : ImuSamples, or array_like, shape (n, 3)
+            Readings of one IMU in order of time, or measured specific force in the sensor frame, m/s^2.
+        rate_s : array_like, shape (n, 3), optional
+            Measured angular rate of the same samples, rad/s.
+        time : array_like, shape (n,), optional
+            When the arrays were measured, s; needed where the sensitive points have lever arms.
+        temperature_c : float, array_like of shape (n,), or TemperatureSamples, optional
+            Needed when the calibration has thermal effects.
+
+        Returns
+        -------
+        ImuSamples, or (ndarray, ndarray)
+            Corrected specific force and rate, of the same type as the input; NaN where a reading cannot be corrected.
+
+        """
+        from imu_calibration.compensation.stream import compensate_readings
+        return compensate_readings(self, samples, rate_s, time=time, temperature_c=temperature_c)
+
+    def __repr__(self):
+        return summary(self)
+
+    def __str__(self):
+        return as_text(self)
+
+    def _repr_html_(self):
+        return as_html(self)
+
+
+HEADINGS = ('parameter', 'value', 'sd', 'unit', 'status')
+NUMBERS = ('value', 'sd')
+"""Columns that are set flush right."""
+
+
+def parameter_rows(calibration: 'Calibration') -> Iterator[tuple[str, ...]]:
+    """Yield the cells of each parameter in the order of `HEADINGS`."""
+    for effect in calibration.model.effects:
+        part = calibration.model.slices[effect.key]
+        for k, index in enumerate(range(part.start, part.stop)):
+            factor, unit = for_people(effect.unit_of(k), effect.sensor)
+            value, sd = with_sd(calibration.values[index] * factor, calibration.own_sd[index] * factor)
+            yield calibration.param_names[index], value, sd, unit, str(calibration.status[index])
+    if common := calibration.common_scale:
+        yield COMMON_SCALE, *with_sd(1.0, common['sd']), '1', str(common['status'])
+
+
+def summary(calibration: 'Calibration') -> str:
+    """Return one line: the frame, the decisions, and how many parameters have which status."""
+    known = list(calibration.status_by_name.values())
+    counts = {status: known.count(status) for status in Status}
+    parts = ', '.join(f'{count} {status}' for status, count in counts.items() if count)
+    return f'<Calibration of {calibration.frame_id or "an IMU"}: {decisions_text(calibration.decisions)}, {parts}>'
+
+
+def as_text(calibration: 'Calibration') -> str:
+    """Return the parameters as a table of plain text."""
+    rows = [HEADINGS, *parameter_rows(calibration)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    aligned = ('  '.join(cell.rjust(width) if heading in NUMBERS else cell.ljust(width)
+                         for cell, width, heading in zip(row, widths, HEADINGS))
+               for row in rows)
+    return '\n'.join([summary(calibration), *map(str.rstrip, aligned)])
+
+
+def as_html(calibration: 'Calibration') -> str:
+    """Return the parameters as an HTML table, for notebooks."""
+    def row(cells: tuple[str, ...], tag: str) -> str:
+        style = [' style="text-align:right"' if heading in NUMBERS else ' style="text-align:left"' for heading in HEADINGS]
+        return '<tr>' + ''.join(f'<{tag}{s}>{escape(cell)}</{tag}>' for cell, s in zip(cells, style, strict=True)) + '</tr>'
+    body = ''.join(row(cells, 'td') for cells in parameter_rows(calibration))
+    return f'<table><caption>{escape(summary(calibration))}</caption>{row(HEADINGS, "th")}{body}</table>'

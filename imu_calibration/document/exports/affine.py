@@ -1,0 +1,233 @@
+"""The largest IMU model of other programs: temperature-dependent offsets, matrices, response to specific force, lever arms."""
+
+import re
+import shlex
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_calibration.core.errors import InputError
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.effects import regressors
+from imu_calibration.effects.base import SENSORS, Effect, Role
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.column_group import ColumnGroup
+from imu_calibration.kinematics.reference_motion import lever_matrix
+
+
+@dataclass(frozen=True)
+class Holding:
+    """Effects of one kind of one sensor."""
+
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    role: Role = Role.TERM
+    """Their place in the sensor's equation."""
+    groups: tuple[ColumnGroup, ...] = ()
+    """Columns of effects that are terms."""
+    own_axis: bool = False
+    """Whether of a matrix only the diagonal can be held."""
+
+    def covers(self, effect: Effect) -> bool:
+        """Return whether an effect is of this kind."""
+        return effect.sensor == self.sensor and effect.role is self.role and (self.role is not Role.TERM or effect.groups == self.groups)
+
+    def held(self, values: np.ndarray) -> np.ndarray:
+        """Return the representable part of an effect's values, shape as given."""
+        return np.diag(np.diag(values.reshape(3, 3))).reshape(values.shape) if self.own_axis else values
+
+    @property
+    def effect(self) -> Effect:
+        """The catalogue's effect of this kind."""
+        return next(effect for effect in CATALOGUE.effects().values() if self.covers(effect))
+
+
+def _both(**kind) -> tuple[Holding, ...]:
+    return tuple(Holding(sensor, **kind) for sensor in SENSORS)
+
+
+OFFSETS = _both(role=Role.OFFSET)
+MATRICES = _both(role=Role.LINEAR)
+SCALES = _both(role=Role.LINEAR, own_axis=True)
+THERMAL_OFFSETS = _both(groups=(regressors.TEMPERATURE,))
+G_SENSITIVITY = (Holding('gyroscope', Role.CROSS),)
+ARMS = (Holding('accelerometer', Role.ARMS),)
+SLOW_OFFSETS = OFFSETS + THERMAL_OFFSETS
+"""Effects that an estimator with biases in its state estimates itself."""
+
+
+def of(sensor: str, holdings: tuple[Holding, ...]) -> tuple[Holding, ...]:
+    """Return the holdings of one sensor."""
+    return tuple(holding for holding in holdings if holding.sensor == sensor)
+
+
+def holding_of(effect: Effect, holdings: tuple[Holding, ...]) -> Holding | None:
+    """Return the holding that covers an effect, or None."""
+    return next((holding for holding in holdings if holding.covers(effect)), None)
+
+
+def _zeros(*shape):
+    return field(default_factory=lambda: {sensor: np.zeros(shape) for sensor in SENSORS})
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AffineImu:
+    """
+    ``readings_i = bias_i + thermal_i (T - T0) + matrix_i @ (input + lever_matrix @ arm_i) + cross_i @ force``.
+
+    The input is true specific force or rate at an origin, in some frame; the readings may have different axes.
+    """
+
+    bias: dict[str, np.ndarray] = _zeros(3)
+    """Sensor -> readings at zero input, SI, shape (3,)."""
+    matrix: dict[str, np.ndarray] = field(default_factory=lambda: {sensor: np.eye(3) for sensor in SENSORS})
+    """Sensor -> response to the input, shape (3, 3)."""
+    thermal: dict[str, np.ndarray] = _zeros(3)
+    """Sensor -> change of the bias with temperature, SI per K, shape (3,)."""
+    cross: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+    """Response of the gyroscope to specific force, (rad/s)/(m/s^2), shape (3, 3)."""
+    arms: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+    """Row i: from the origin to the sensitive point of accelerometer i, m, shape (3, 3)."""
+    temperature_ref_c: float = 25.0
+    """T0, degrees Celsius."""
+    temperature_range_c: tuple[float, float] | None = None
+    """Where the thermal part was measured, degrees Celsius; None: not known."""
+
+    def value(self, holding: Holding) -> np.ndarray:
+        """Return the values of the effects of one kind."""
+        for kinds, part in ((OFFSETS, self.bias), (MATRICES + SCALES, self.matrix), (THERMAL_OFFSETS, self.thermal)):
+            if holding in kinds:
+                return part[holding.sensor]
+        return self.cross if holding in G_SENSITIVITY else self.arms
+
+
+def held_values(calibration: Calibration, effect: Effect, holding: Holding | None) -> np.ndarray:
+    """Return the values of an effect as the target represents them: its prior where it is not represented, shape (size,)."""
+    values = calibration.values[calibration.model.slices[effect.key]]
+    return effect.prior_values() if holding is None else holding.held(values)
+
+
+def affine_of(calibration: Calibration, holdings: tuple[Holding, ...]) -> AffineImu:
+    """Return that part of a calibration which lies in `holdings`."""
+    limits = calibration.conditions.get('temperature_range_c')
+    found = AffineImu(temperature_ref_c=calibration.model.temperature_ref_c, temperature_range_c=tuple(limits) if limits else None)
+    for holding in holdings:
+        for effect in filter(holding.covers, calibration.model.effects):
+            found.value(holding)[...] = held_values(calibration, effect, holding).reshape(effect.shape)
+    return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Placement:
+    """Frame, origin and axes of readings of a program, against ours."""
+
+    mat_ts: np.ndarray = field(default_factory=lambda: np.eye(3))
+    """Turns vectors of our sensor frame into the program's frame."""
+    origin_s: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """From our origin to the program's, in our sensor frame, m."""
+    mat_readings: np.ndarray = field(default_factory=lambda: np.eye(3))
+    """Turns our readings into the axes in which the program gets them."""
+
+    def inverse(self) -> 'Placement':
+        """Return the placement that undoes this one."""
+        return Placement(mat_ts=self.mat_ts.T, origin_s=-self.mat_ts @ self.origin_s, mat_readings=self.mat_readings.T)
+
+    def readings(self, force: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return readings in the program's axes, each shape (n, 3)."""
+        return force @ self.mat_readings.T, rate @ self.mat_readings.T
+
+    def truth(self, force: np.ndarray, rate: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return true specific force and rate at the program's origin in its frame, each shape (n, 3)."""
+        return (force + lever_matrix(rate, alpha) @ self.origin_s) @ self.mat_ts.T, rate @ self.mat_ts.T
+
+
+def moved(imu: AffineImu, to: Placement) -> AffineImu:
+    """
+    Return the same IMU in the frame, origin and axes of another program.
+
+    With ``f = mat_ts' f_t - lever_matrix @ origin_s``; the effect of the change of origin on the gyroscope's response to specific force
+    (a product of two small terms) is omitted.
+    """
+    turned = {sensor: to.mat_readings @ imu.matrix[sensor] @ to.mat_ts.T for sensor in SENSORS}
+    arms = np.abs(to.mat_readings) @ ((imu.arms - to.origin_s) @ to.mat_ts.T) if np.any(imu.arms) else imu.arms
+    bias, thermal = ({sensor: to.mat_readings @ part[sensor] for sensor in SENSORS} for part in (imu.bias, imu.thermal))
+    return replace(imu, bias=bias, matrix=turned, thermal=thermal, arms=arms, cross=to.mat_readings @ imu.cross @ to.mat_ts.T)
+
+
+PUBLISHER = 'static_transform_publisher'
+NUMBERS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
+PARENT, CHILD = 'frame-id', 'child-frame-id'
+UNNAMED = 'sensor_frame'
+"""Name of the sensor frame where the calibration has none."""
+
+
+def pose_line(placement: Placement, parent: str, child: str) -> str:
+    """Return the transform with the arguments of the program of tf2_ros, with all digits."""
+    values = [*placement.origin_s, *Rotation.from_matrix(placement.mat_ts.T).as_quat()]
+    pose: dict[str, str] = {name: repr(float(value)) for name, value in zip(NUMBERS, values)}
+    return ' '.join([PUBLISHER, *(f'--{name} {shlex.quote(value)}' for name, value in (pose | {PARENT: parent, CHILD: child}).items())])
+
+
+def find_pose(content: bytes) -> tuple[Placement, str] | None:
+    """Return (placement, our frame) of the first such line in a file, None where there is none: in files of other programs."""
+    line = re.search(rf'{PUBLISHER} (.*)', content.decode(errors='replace'))
+    try:
+        words = shlex.split(line.group(1).partition('"')[0]) if line else []
+        options = {name.removeprefix('--'): value for name, value in zip(words, words[1:], strict=False) if name.startswith('--')}
+        values = np.array([float(options[name]) for name in NUMBERS])
+        parent = options[PARENT]
+    except (KeyError, ValueError):
+        return None
+    if not np.all(np.isfinite(values)) or not 0.99 < np.linalg.norm(values[3:]) < 1.01:
+        return None
+    return Placement(mat_ts=Rotation.from_quat(values[3:]).as_matrix().T, origin_s=values[:3]), '' if parent == UNNAMED else parent
+
+
+FRD = np.diag([1.0, -1.0, -1.0])
+"""From forward-left-up, as in ROS, to forward-right-down, as in autopilots; its own inverse."""
+_TURNED_ROUND = np.eye(3)[::-1]
+
+
+def lower_times_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return (L, Q) with ``matrix = L @ Q``: L lower triangular with positive diagonal, Q a rotation.
+
+    Raises
+    ------
+    InputError
+        When the axes of the matrix are left-handed.
+
+    """
+    if np.linalg.det(matrix) <= 0:
+        raise InputError('the axes of a sensor must be right-handed, the matrix of this calibration turns them into their mirror image; '
+                         'check for an exchanged axis', code='left_handed')
+    q, r = np.linalg.qr(matrix.T)
+    signs = np.sign(np.diag(r))
+    return np.tril((r * signs[:, None]).T), (q * signs).T
+
+
+def upper_times_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (U, Q) with ``matrix = U @ Q``: U upper triangular with positive diagonal, Q a rotation."""
+    lower, rotation = lower_times_rotation(_TURNED_ROUND @ matrix @ _TURNED_ROUND)
+    return _TURNED_ROUND @ lower @ _TURNED_ROUND, _TURNED_ROUND @ rotation @ _TURNED_ROUND
+
+
+def as_mounted(_imu: AffineImu) -> Placement:
+    """Return the placement of a program with unchanged axes."""
+    return Placement()
+
+
+def accelerometer_lower(imu: AffineImu) -> Placement:
+    """Return the placement in which the accelerometer's matrix is lower triangular."""
+    return Placement(mat_ts=lower_times_rotation(imu.matrix['accelerometer'])[1])
+
+
+def accelerometer_lower_at_x(imu: AffineImu) -> Placement:
+    """Return the same with the origin in the sensitive point of the x accelerometer."""
+    return Placement(mat_ts=lower_times_rotation(imu.matrix['accelerometer'])[1], origin_s=imu.arms[0])
+
+
+def forward_right_down(_imu: AffineImu) -> Placement:
+    """Return the placement of an autopilot: readings and frame forward-right-down."""
+    return Placement(mat_ts=FRD, mat_readings=FRD)

@@ -1,0 +1,255 @@
+"""The export: a calibration and its noise as a file for a target, with the loss."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from pkgutil import iter_modules
+
+import numpy as np
+
+import imu_calibration
+from imu_calibration.allan.figures import Densities, NoiseFigures
+from imu_calibration.allan.summary import BASIS
+from imu_calibration.core.errors import InputError, did_you_mean
+from imu_calibration.core.units import error_text
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import to_mapping
+from imu_calibration.document.exports import targets
+from imu_calibration.document.exports.affine import ARMS, MATRICES, UNNAMED, AffineImu, Placement, affine_of, moved, pose_line
+from imu_calibration.document.exports.loss import NOTHING, Loss, TrialMotion, loss_of, standard_motion
+from imu_calibration.document.exports.target import Noise, Numbers, Page, Readings, Target
+from imu_calibration.document.trust import Usable, caveats, usable
+from imu_calibration.effects.base import SENSORS, UNIT, Role
+
+
+@dataclass(frozen=True, eq=False)
+class Export:
+    """A file for a target."""
+
+    content: bytes
+    """The file."""
+    numbers: Numbers
+    """Its content of the calibration."""
+    placement: Placement
+    """Frame, origin and axes of these numbers."""
+    loss: Loss
+    """Loss of the export."""
+    lines: tuple[str, ...]
+    """Notes: the same in the file and on the terminal."""
+    refused: Mapping[str, str] = field(default_factory=dict)
+    """Sensor whose numbers are those of a data sheet -> why."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 written, 3 without the numbers of one sensor."""
+        return 3 if self.refused else 0
+
+
+def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | None = None, rate: float | None = None,
+           motion: TrialMotion | None = None, anyway: bool = False) -> Export:
+    """
+    Return the file of a target.
+
+    A sensor that compensation does not correct has the nominal numbers; its loss is the whole error by the calibration. For a target that
+    contains the complete document, with its decisions.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    target : Target
+    noise : NoiseFigures, optional
+        From a noise document; without one the white noise of the calibration's recording is used, without random walks.
+    rate : float, optional
+        Rate at which the target gets the readings, Hz; default that of the noise document.
+    motion : TrialMotion, optional
+        Where the loss is measured; default `motion.standard_motion`.
+    anyway : bool
+        Also the numbers of a sensor whose decision is `harms`.
+
+    Raises
+    ------
+    InputError
+        When the target needs noise that is not there, or the calibration cannot be brought into its axes.
+    DocumentError
+        When no sensor should be corrected with the calibration.
+
+    """
+    used = Usable(calibration) if target.whole or target.only_noise else usable(calibration, anyway=anyway)
+    applied = used.calibration
+    if rate is not None and not 0 < rate < np.inf:
+        raise InputError(f'the rate must be above zero, got {rate:g} Hz; correct it', code='rate_not_positive')
+    found, unknown = _noise_numbers(applied, target, noise, rate)
+    placement, numbers = placed_numbers(applied, target)
+    motion = motion or standard_motion(applied)
+    loss = loss_of(target, calibration, numbers, placement=placement, motion=motion)
+    lines = [*_placement_lines(applied, target, placement), *_worked_sample(target, numbers, placement, applied),
+             *loss_lines(target, loss), *(f'note: {line}' for line in (*_trust_lines(used), *target.ignored(numbers), *unknown)),
+             *(f'note: {hint}' for hint in [target.hint] if hint)]
+    head = [f'{target.title}, written by imu_calibration {imu_calibration.__version__}', *target.formula.splitlines(), f'({target.source})']
+    rate = rate or (noise.rate if noise else None)
+    assert target.write is not None   # `registry.find_target` gives no other
+    content = target.write(Page(numbers, found, [*head, *lines], applied, rate))
+    return Export(content.encode() if isinstance(content, str) else content, numbers, placement, loss, tuple(lines), used.refused)
+
+
+def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement, Numbers]:
+    """Return the placement of a target for a calibration and the numbers there."""
+    if target.whole:
+        return Placement(), to_mapping(calibration)
+    held = affine_of(calibration, target.holds)
+    placement = target.placement(_with_arms_and_matrices(calibration, held))
+    return placement, target.numbers(moved(held, placement))
+
+
+def _with_arms_and_matrices(calibration, held) -> AffineImu:
+    """Return the IMU by which a target chooses its axes: with full matrices, also where it has diagonals only."""
+    return affine_of(calibration, MATRICES + ARMS) if np.any(held.arms) else affine_of(calibration, MATRICES)
+
+
+def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, list[str]]:
+    """Return (noise in the target's terms or None, notes on unknown figures)."""
+    if target.noise is None:
+        return None, []
+    found = _noise_of(calibration, figures, rate)
+    if found is None or (target.needs_walk and not found.walk_known):
+        lacks = 'noise with random walks' if target.needs_walk else 'noise, or the rate of the readings of the calibration,'
+        if target.only_noise:
+            raise InputError(f'for {target.title} there must be {lacks} and there is none; give a noise document', key='noise',
+                             code='noise_missing')
+        return None, [f'the noise figures are left out: there must be {lacks} from a noise document']
+    return target.noise(found), _walk_lines(found) if target.needs_walk else []
+
+
+def _trust_lines(used: Usable) -> list[str]:
+    """Return the decisions other than `helps`, and the parameters that are not determined."""
+    return [f'of the calibration: {line}' for line in (*used.lines, *caveats(used.calibration))]
+
+
+def _walk_lines(noise: Noise) -> list[str]:
+    """Describe random walks that are equivalents or bounds."""
+    basis = {sensor: getattr(noise, sensor).basis for sensor in SENSORS}
+    return [f'random walk of the {sensor}: {BASIS[found]}' for sensor, found in basis.items() if found != 'walk']
+
+
+def _noise_of(calibration, figures, rate) -> Noise | None:
+    if figures is not None:
+        accelerometer, gyroscope = (figures.densities(sensor) for sensor in SENSORS)
+        unbounded = [sensor for sensor, found in zip(SENSORS, (accelerometer, gyroscope)) if not np.isfinite(found.walk)]
+        if unbounded:
+            raise InputError(f'the noise document must bound the random walk of both sensors, that of the {" and ".join(unbounded)} has no '
+                             'bound; record a longer rest', key='noise', code='walk_unbounded')
+        return Noise(accelerometer, gyroscope, rate or figures.rate)
+    white = {sensor: float(calibration.noise(sensor)[0].max()) for sensor in SENSORS}
+    if rate is None or not all(white.values()):
+        return None
+    accelerometer, gyroscope = (Densities(white[sensor] / float(np.sqrt(rate)), 0.0, 'bound') for sensor in SENSORS)
+    return Noise(accelerometer, gyroscope, rate, walk_known=False)
+
+
+def _placement_lines(calibration, target, placement) -> list[str]:
+    """Describe the frame of the numbers relative to the sensor frame."""
+    name = calibration.frame_id or UNNAMED
+    if target.only_noise:
+        return []
+    if np.array_equal(placement.mat_readings, np.eye(3)) and np.array_equal(placement.mat_ts, np.eye(3)) and not np.any(placement.origin_s):
+        return [f'frame: {name}, axes as in the calibration']
+    if not np.array_equal(placement.mat_readings, np.eye(3)):
+        return [f'frame: forward-right-down, x as in {name}, y and z reversed, readings too']
+    child = f'{name}_{target.name}'
+    return [f"frame: {child}, turned and moved against {name} as the target's conventions demand; extrinsics change with it:",
+            f'  {pose_line(placement, name, child)}']
+
+
+def _worked_sample(target, numbers, placement, calibration) -> list[str]:
+    """Show one reading before and after the target's formula."""
+    if target.whole or target.only_noise or target.estimates:
+        return []
+    temperature = np.array([calibration.model.temperature_ref_c])
+    raw = np.array([[0.5, -0.3, 9.7]]), np.array([[0.1, -0.2, 0.3]])
+    force, rate = placement.readings(*raw)
+    made = target.corrected(numbers, Readings(force, rate, np.zeros((1, 3)), temperature))
+    shown = [', '.join(f'{value:.9g}' for value in values[0]) for values in (force, rate, *made)]
+    return [f'worked sample: readings [{shown[0]}] m/s^2, [{shown[1]}] rad/s become [{shown[2]}], [{shown[3]}]']
+
+
+def loss_lines(target: Target, loss: Loss) -> list[str]:
+    """Return the losses, a line each."""
+    if target.only_noise:
+        left = ', '.join(f'{sensor} {error_text(value, UNIT[sensor])}' for sensor, value in loss.left.items())
+        beside = ' in addition to a constant bias' if target.estimates else ''
+        return ['accepts no calibration: use compensated readings (compensator_node, or the verb compensate)',
+                f'fed with raw readings it is left with an error of rms {left}{beside}, on {loss.motion}']
+    lines = []
+    if loss.estimated:
+        lines.append('not written, because the target estimates it while it runs: ' + _names(loss.estimated))
+    if loss.nothing:
+        return [*lines, 'lost: nothing']
+    for lost in loss.effects:
+        what = 'held in part' if lost.in_part else 'lost'
+        lines.append(f'{what}: {lost.effect.sensor} {lost.effect.name}, {error_text(lost.rms, UNIT[lost.effect.sensor])} rms')
+    for sensor in SENSORS:
+        left, raw = (error_text(error[sensor], UNIT[sensor]) for error in (loss.left, loss.raw))
+        left = f'{left} rms' if loss.left[sensor] > NOTHING else 'none'
+        lines.append(f'remaining error of the {sensor}: {left} (raw readings: {raw}), on {loss.motion}')
+    return lines
+
+
+def _names(effects) -> str:
+    return ', '.join(f'{effect.sensor} {effect.name}' for effect in effects)
+
+
+def holds_in_words(target: Target) -> str:
+    """Return a short description of a target's capacity."""
+    if target.whole:
+        return 'everything'
+    parts: dict[str, list[str]] = {}
+    for holding in target.holds:
+        name = 'scale factors' if holding.own_axis else 'matrix' if holding.role is Role.LINEAR else holding.effect.heading
+        name = name.split(' (')[0].split(':')[0]
+        for sensor in SENSORS:   # a heading may begin with its sensor
+            name = name.removeprefix('accel ' if sensor == SENSORS[0] else 'gyro ')
+        parts.setdefault(name, []).append(holding.sensor)
+    return ', '.join(name if len(sensors) == 2 else f'{name} ({sensors[0]})' for name, sensors in parts.items()) or '-'
+
+
+@cache
+def all_targets() -> dict[str, Target]:
+    """Return every target by name, in alphabetical order."""
+    modules = [import_module(f'{targets.__name__}.{found.name}') for found in iter_modules(targets.__path__)]
+    return {target.name: target for target in sorted((t for module in modules for t in module.TARGETS), key=lambda t: t.name)}
+
+
+def find_target(name: str) -> Target:
+    """
+    Return the target of a name.
+
+    Raises
+    ------
+    InputError
+        When there is none.
+
+    """
+    return _find(name, [target for target in all_targets().values() if target.write is not None], 'written')
+
+
+def find_reader(name: str) -> Target:
+    """
+    Return the target of a name; its files must be readable.
+
+    Raises
+    ------
+    InputError
+        When there is none.
+
+    """
+    return _find(name, [target for target in all_targets().values() if target.read is not None], 'read')
+
+
+def _find(name: str, fitting: list[Target], what: str) -> Target:
+    for target in fitting:
+        if target.name == name:
+            return target
+    raise InputError(f"the name of a program whose files can be {what} is required, got '{name}'"
+                     f"{did_you_mean(name, (target.name for target in fitting))}; choose from "
+                     f"{', '.join(target.name for target in fitting)}")

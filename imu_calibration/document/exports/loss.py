@@ -1,0 +1,194 @@
+"""The part of a calibration that a program cannot represent, and the resulting error."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.compensation.angular_acceleration import StampedDerivative, typical_period
+from imu_calibration.compensation.compensate import invertible_values
+from imu_calibration.compensation.stream import CompensationStream, derivative_for
+from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples, TemperatureSamples
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.exports.affine import Holding, Placement, held_values, holding_of
+from imu_calibration.document.exports.target import Numbers, Readings, Target
+from imu_calibration.effects.base import SENSORS, Effect
+from imu_calibration.effects.forward_equations import sensor_output
+from imu_calibration.kinematics.reference_motion import Reference
+
+SECONDS, SAMPLES_PER_SECOND = 60.0, 50
+FREQUENCIES = np.array([0.3, 0.4, 0.5])
+"""Hz; of the rates about x, y, z."""
+USUAL_RATE = 1.0
+"""rad/s; default for a document without the speed of its motion."""
+TURNS = 15
+"""Turns of the spiral of gravity from nadir to zenith."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrialMotion:
+    """True motion on which a loss is measured."""
+
+    reference: Reference
+    """Specific force, rate and angular acceleration at our origin in our sensor frame."""
+    temperature_c: np.ndarray
+    """Temperature, degrees Celsius, shape (n,)."""
+    text: str
+    """Description."""
+
+
+def motion_of(force: np.ndarray, rate: np.ndarray, alpha: np.ndarray, *, temperature_c: np.ndarray, text: str) -> TrialMotion:
+    """Return a motion from its arrays, shapes (n, 3) and (n,)."""
+    attitude = np.broadcast_to(np.eye(3), (len(force), 3, 3))
+    reference = Reference(np.zeros(len(force)), attitude, force, rate, alpha, STANDARD_GRAVITY, temperature_c)
+    return TrialMotion(reference, temperature_c, text)
+
+
+def standard_motion(calibration: Calibration) -> TrialMotion:
+    """
+    Return the declared motion of a calibration: a minute with gravity in all directions and rates as large as in its recording.
+
+    Gravity runs along a spiral from nadir to zenith; each rate swings with the calibration's largest rate, or 1 rad/s, at 0.3 to 0.5 Hz;
+    the temperature runs through the calibration's range. The three are drawn independently of one another.
+    """
+    conditions = calibration.conditions
+    largest = conditions.get('largest_rate') or USUAL_RATE
+    gravity = conditions.get('gravity')
+    gravity = gravity if isinstance(gravity, float) and gravity > 0 else STANDARD_GRAVITY
+    time = np.arange(int(SECONDS * SAMPLES_PER_SECOND)) / SAMPLES_PER_SECOND
+    height = np.linspace(-1.0, 1.0, len(time))
+    turn, level = 2 * np.pi * TURNS * time / SECONDS, np.sqrt(1.0 - height**2)
+    force = gravity * np.stack([level * np.cos(turn), level * np.sin(turn), height], axis=1)
+    phase = 2 * np.pi * FREQUENCIES * time[:, None]
+    rate, alpha = largest * np.sin(phase), largest * 2 * np.pi * FREQUENCIES * np.cos(phase)
+    low, high = conditions.get('temperature_range_c') or [calibration.model.temperature_ref_c] * 2
+    temperature = np.linspace(low, high, len(time))
+    warmth = f'{low:g} C' if low == high else f'{low:g} to {high:g} C'
+    text = f'a standard motion (gravity in all directions, {largest:.3g} rad/s at 0.3 to 0.5 Hz about each axis, {warmth})'
+    return motion_of(force, rate, alpha, temperature_c=temperature, text=text)
+
+
+def recorded_motion(calibration: Calibration, imu: ImuSamples, temperature: TemperatureSamples | None, *, name: str) -> TrialMotion:
+    """
+    Return the motion of a recording as the calibration sees it: its compensated readings.
+
+    Angular acceleration is the slope of the compensated rates, by the filter of the compensation.
+
+    Raises
+    ------
+    InputError
+        When no part of it can be compensated.
+
+    """
+    corrected = CompensationStream(calibration, temperature=temperature).correct(imu)
+    kept = np.isfinite(corrected.force).all(axis=1) & np.isfinite(corrected.rate).all(axis=1) & ~corrected.flagged
+    if not kept.any():
+        raise InputError(f'{name} must have readings that can be compensated, it has none; give another recording')
+    stamps = imu.stamp_ns[kept]
+    slope = StampedDerivative(derivative_for(calibration, typical_period(stamps[:10_000]) or 0.01))
+    alpha = slope.push_block(stamps, corrected.rate[kept])
+    return motion_of(corrected.force[kept], corrected.rate[kept], alpha, temperature_c=temperature_at(calibration, temperature, stamps),
+                     text=f'{name} ({int(kept.sum())} samples)')
+
+
+def temperature_at(calibration: Calibration, temperature: TemperatureSamples | None, stamp_ns: np.ndarray) -> np.ndarray:
+    """Return the temperature at stamps, shape (n,): the calibration's reference where none was measured."""
+    if temperature is None or not len(temperature):
+        return np.full(len(stamp_ns), calibration.model.temperature_ref_c)
+    first = temperature.stamp_ns[0]
+    return np.interp((stamp_ns - first) * 1e-9, (temperature.stamp_ns - first) * 1e-9, temperature.temperature_c)
+
+
+NOTHING = 1e-9
+"""m/s^2, rad/s; smaller differences are rounding."""
+
+
+@dataclass(frozen=True)
+class LostEffect:
+    """An effect of the calibration that a program cannot hold, or not wholly."""
+
+    effect: Effect
+    """Which."""
+    in_part: bool
+    """Whether a part of it is held."""
+    rms: float
+    """Root mean square of its contribution to the readings, per component, SI."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loss:
+    """Loss of an export on a motion."""
+
+    effects: tuple[LostEffect, ...]
+    """Effects that are not represented, in the catalogue's order."""
+    estimated: tuple[Effect, ...]
+    """Effects that the program finds by itself; they count as known here."""
+    left: dict[str, float]
+    """Sensor -> rms difference per component between the program's readings and the full compensation, SI."""
+    raw: dict[str, float]
+    """Sensor -> rms difference per component between raw readings and the full compensation, SI."""
+    motion: str
+    """Description of the motion."""
+
+    @property
+    def nothing(self) -> bool:
+        """Whether the program's readings equal the full compensation."""
+        return not self.effects and max(self.left.values()) < NOTHING
+
+
+def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, placement: Placement, motion: TrialMotion) -> Loss:
+    """
+    Return the loss of a target on a motion.
+
+    Readings are simulated without noise by the model that compensation inverts. The effects that the target estimates are removed from
+    them; the target's formula is applied; the result is compared with the true motion in its frame, at its origin.
+
+    Parameters
+    ----------
+    target : Target
+    calibration : Calibration
+    numbers : dict
+        Content of the target's file.
+    placement : Placement
+        Frame, origin and axes of its numbers.
+    motion : TrialMotion
+
+    """
+    model, values = invertible_values(calibration)
+    ref, effects = motion.reference, {effect.key: effect for effect in model.effects}
+    read = {sensor: sensor_output(model, sensor, values, ref=ref) for sensor in SENSORS}
+    without = values.copy()
+    estimated = tuple(e for e in effects.values() if holding_of(e, target.estimates) and e.key in calibration.model.slices)
+    for effect in estimated:
+        without[model.slices[effect.key]] = effect.prior_values()
+    seen = {sensor: sensor_output(model, sensor, without, ref=ref) for sensor in SENSORS}
+    true = placement.truth(ref.force_s, ref.rate_s, ref.alpha_s)
+    if target.whole:
+        made = true   # it represents all effects of the full compensation
+    else:
+        force, rate = placement.readings(*seen.values())
+        readings = Readings(force, rate, ref.alpha_s @ placement.mat_ts.T, motion.temperature_c)
+        made = target.corrected(numbers, readings)
+    lost = () if target.whole else tuple(_lost(calibration, effect, target.holds, motion) for effect in effects.values()
+                                         if effect not in estimated and not _whole(calibration, effect, target.holds))
+    return Loss(lost, estimated, {s: _rms(m - t) for s, m, t in zip(SENSORS, made, true)},
+                {s: _rms(read[s] - t) for s, t in zip(SENSORS, (ref.force_s, ref.rate_s))}, motion.text)
+
+
+def _whole(calibration, effect, holds: tuple[Holding, ...]):
+    values = calibration.values[calibration.model.slices[effect.key]]
+    return np.array_equal(held_values(calibration, effect, holding_of(effect, holds)), values)
+
+
+def _lost(calibration, effect, holds, motion):
+    """Return the part of the readings due to the part of an effect that is not represented."""
+    model, values = invertible_values(calibration)
+    holding, less = holding_of(effect, holds), values.copy()
+    less[model.slices[effect.key]] = held_values(calibration, effect, holding)
+    change = [sensor_output(model, effect.sensor, v, ref=motion.reference) for v in (values, less)]
+    return LostEffect(effect, holding is not None, _rms(change[0] - change[1]))
+
+
+def _rms(values):
+    return float(np.sqrt(np.mean(values**2)))

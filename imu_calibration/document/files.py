@@ -1,0 +1,282 @@
+"""Files that the verbs read and write, atomically."""
+
+import hashlib
+import io
+import os
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from errno import EISDIR
+from itertools import count
+from os import PathLike
+from pathlib import Path
+from secrets import token_hex
+from stat import S_ISDIR
+from tempfile import TemporaryFile
+from typing import Any
+
+from imu_calibration.allan.document import noise_from_text
+from imu_calibration.allan.figures import NoiseFigures
+from imu_calibration.core import documents
+from imu_calibration.core.errors import InputError, shortened
+from imu_calibration.core.regular_files import open_regular
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration_text import calibration_from_text, checked_tolerances
+from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
+from imu_calibration.kinematics.table import Table
+
+
+def user_path(text: str) -> Path:
+    """
+    Return the absolute path that a user means, with ``~`` for the home folder.
+
+    Raises
+    ------
+    InputError
+        When there is no such user.
+
+    """
+    try:
+        return Path(os.path.abspath(Path(text).expanduser()))
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f'{text!r} must be a path: {error}; correct it', code='not_a_path') from error
+
+
+def read_text(path: str | PathLike[str], what: str) -> str:
+    """Return the text of a file, or refuse in one line; not more than a document may hold is read."""
+    try:
+        with io.TextIOWrapper(open_regular(path), encoding='utf-8') as stream:
+            text = stream.read(documents.LARGEST + 1)
+    except (OSError, ValueError) as error:
+        raise InputError(f'the {what} {path} must be a readable text file: {_why(error)}; correct the path',
+                         code='file_unreadable') from error
+    return text
+
+
+def read_bytes(path: str | PathLike[str], what: str) -> bytes:
+    """Return the bytes of a file, or refuse in one line."""
+    try:
+        with open_regular(path) as stream:
+            return stream.read()
+    except (OSError, ValueError) as error:
+        raise InputError(f'the {what} {path} must be readable: {_why(error)}; correct the path') from error
+
+
+def _why(error):
+    return getattr(error, 'strerror', None) or str(error) or type(error).__name__
+
+
+def read_mapping(path: str | PathLike[str], what: str, checked: Callable | type = dict) -> Any:
+    """Return the mapping in a YAML file, as `checked` returns it; an error of either names the file."""
+    try:
+        return checked(documents.from_text(read_text(path, what), what))
+    except InputError as error:
+        raise error.named(str(path)) from error
+
+
+def read_table(path: str | PathLike[str]) -> Table:
+    """Return the table that a YAML file describes."""
+    return Table.from_mapping(read_mapping(path, 'table description'))
+
+
+def read_tolerances(path: Path, catalogue: Catalogue = CATALOGUE) -> dict[str, dict[str, float]]:
+    """Return the tolerances in a YAML file: {section: {effect: tolerance}}."""
+    return read_mapping(path, 'tolerance file', lambda mapping: checked_tolerances(mapping, catalogue))
+
+
+def read_effects(path: str | PathLike[str], catalogue: Catalogue = CATALOGUE) -> Catalogue:
+    """Return the catalogue with the effects that a YAML file defines, a file of effects or a calibration."""
+    return read_mapping(path, 'file of effects', catalogue.with_document)
+
+
+def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False) -> str:
+    """
+    Return the text of a robot description.
+
+    Parameters
+    ----------
+    path : path-like
+    allow_xacro : bool
+        Expand a .xacro file. Its expressions can execute any Python code, so that expanding it is running a program.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read or expanded, or is a .xacro file without that permission.
+
+    """
+    text = read_text(path, 'robot description')
+    if Path(path).suffix != '.xacro':
+        return text
+    if not allow_xacro:
+        raise InputError(f'a .xacro file is a program and needs explicit permission to run, got {path}; expand it to a .urdf, or allow it '
+                         'if you trust its author', key='allow_xacro')
+    try:
+        import xacro
+    except ImportError as error:
+        raise InputError("a .xacro file needs the package xacro, it is not installed; install 'imu_calibration[arm]'",
+                         code='package_missing') from error
+    try:
+        return xacro.process_file(str(path)).toxml()
+    except Exception as error:   # expressions in macros may raise any exception
+        reason = shortened(str(error), 200) or type(error).__name__
+        raise InputError(f'the robot description {path} must be one that xacro can expand, it says: {reason}; correct it, or expand it '
+                         'yourself to a .urdf', code='xacro_fails') from error
+
+
+def read_calibration(path: str | PathLike[str]) -> Calibration:
+    """Return the calibration in a file."""
+    return calibration_from_text(read_text(path, 'calibration'))
+
+
+def read_noise(path: str | os.PathLike) -> NoiseFigures:
+    """Return the noise in a file that the verb `noise` wrote; an error names the file."""
+    try:
+        return noise_from_text(read_text(path, 'noise document'))
+    except InputError as error:
+        raise error.named(str(path)) from error
+
+
+def make_folder(path: str | PathLike[str]) -> Path:
+    """Return the output folder, made and checked for writing before any work is done."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
+    except (OSError, ValueError) as error:
+        raise InputError(f'the output folder {folder} must be writable: {_why(error)}; choose another one') from error
+    return folder
+
+
+@contextmanager
+def output_folder(path: str) -> Iterator[Path]:
+    """Yield the output folder; when the work is refused, folders made for it are removed."""
+    missing = [folder for folder in (Path(path), *Path(path).parents) if not folder.exists()]
+    folder = make_folder(path)
+    try:
+        yield folder
+    except BaseException:
+        with suppress(OSError):   # a folder with content is not removed
+            for made in missing:
+                made.rmdir()
+        raise
+
+
+def write_text(path: str | PathLike[str], text: str) -> None:
+    """Write a text file atomically; raises as `write_whole`."""
+    write_whole(path, text.encode(), to_disk=False)
+
+
+def hash_of(path: str | PathLike[str]) -> str:
+    """Return the SHA-256 of a file, or of the data files of a bag in order of name, as hexadecimal digits."""
+    path, digest = Path(path), hashlib.sha256()
+    files = sorted(f for f in path.rglob('*') if f.is_file() and f.name != 'metadata.yaml') if path.is_dir() else [path]
+    for file in files:
+        with open(file, 'rb') as stream:
+            while chunk := stream.read(1 << 20):
+                digest.update(chunk)
+    return digest.hexdigest()
+
+
+def write_whole(path: str | PathLike[str], data: bytes, to_disk: bool = True) -> None:
+    """
+    Write bytes to a temporary file in the same folder and rename it.
+
+    Parameters
+    ----------
+    path : path-like
+    data : bytes
+    to_disk : bool
+        Wait until the data are on the disk, so that they survive a power failure; seconds on a busy disk.
+
+    Raises
+    ------
+    InputError
+        When the path cannot be written; an existing file is unchanged.
+
+    """
+    path = Path(path)
+    with _beside(path) as beside:
+        with open(beside, 'xb') as stream:
+            stream.write(data)
+            if to_disk:
+                stream.flush()
+                os.fsync(stream.fileno())
+        os.replace(beside, path)
+
+
+def try_place(path: Path) -> None:
+    """
+    Check that `write_whole` could write a file now; only its folder remains.
+
+    Raises
+    ------
+    InputError
+        When it could not.
+
+    """
+    path = Path(path)
+    with _beside(path) as beside:
+        with open(beside, 'xb') as stream:
+            stream.write(b'.')
+        with suppress(FileNotFoundError):
+            if S_ISDIR(os.stat(path).st_mode):
+                raise IsADirectoryError(EISDIR, os.strerror(EISDIR))
+
+
+def put_aside(path: str | PathLike[str]) -> Path:
+    """
+    Rename a file to the first of NAME.1, NAME.2, ... that is free, and return that.
+
+    Raises
+    ------
+    InputError
+        When it cannot be renamed.
+
+    """
+    path = Path(path)
+    free = next(path.with_name(f'{path.name}.{number}') for number in count(1) if not path.with_name(f'{path.name}.{number}').exists())
+    try:
+        os.rename(path, free)
+    except OSError as error:
+        raise InputError(f'{path} must be movable to {free.name}: {_why(error)}; move it away') from error
+    return free
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove the temporary files of processes that were killed while they wrote a file; errors are ignored."""
+    with suppress(OSError, ValueError):
+        for found in path.parent.glob(f'.[0-9]*.{_ending(path)}'):
+            number = found.name.split('.')[1]
+            if number.isdigit() and not _is_running(int(number)):
+                found.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:   # of another user
+        pass
+    return True
+
+
+def _ending(path: Path) -> str:
+    return f'{zlib.crc32(path.name.encode(errors="replace")):08x}'
+
+
+@contextmanager
+def _beside(path):
+    """Yield an unpredictable name in the same folder for a new file; an error becomes one line, and that file is removed."""
+    # A link placed under a predictable name would be followed; a suffix to a name of the longest length would exceed the limit.
+    beside = path.parent / f'.{os.getpid()}.{token_hex(8)}.{_ending(path)}'
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield beside
+    except (OSError, ValueError) as error:
+        raise InputError(f'{path} must be writable: {_why(error)}; choose another place', code='not_writable') from error
+    finally:
+        with suppress(OSError, ValueError):   # in a read-only folder removal fails too
+            beside.unlink(missing_ok=True)

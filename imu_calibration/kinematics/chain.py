@@ -1,0 +1,248 @@
+"""Exact kinematics of a serial chain of joints that turn or slide."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from imu_calibration.kinematics.earth import earth_rate_n
+from imu_calibration.kinematics.perturbed_table import wobble_at
+from imu_calibration.kinematics.reference_motion import Reference, align, rotation
+from imu_calibration.kinematics.table import axis_error_directions
+
+if TYPE_CHECKING:
+    from imu_calibration.kinematics.joint_motion import JointMotion
+    from imu_calibration.kinematics.table import Table
+
+_BLOCK = 8192  # samples whose intermediates fit in the processor's cache
+
+
+class _Link(NamedTuple):
+    """A joint as the recursion needs it."""
+
+    axis: np.ndarray
+    xyz: np.ndarray
+    mat_in: np.ndarray
+    """From the frame of the link before to the joint's frame, shape (3, 3)."""
+    turns: bool
+    column: int
+    """Column of the motion that drives it."""
+    multiplier: float
+    plus: float
+    sag: float
+    wobble: tuple
+    across: np.ndarray
+    """`axis_error_directions`, shape (2, 3)."""
+
+    @property
+    def leans(self):
+        return bool(self.sag or self.wobble)
+
+
+class _Step(NamedTuple):
+    """One step of the outward transformation of vectors: an offset, a constant matrix, then the joint."""
+
+    offset: np.ndarray
+    matrix: np.ndarray
+    link: _Link | None
+    """The joint that moves, or None after the last one."""
+    sense: float = 1.0
+    third: int = 2
+    """Coordinate axis that the joint turns about, in this sense."""
+    across: np.ndarray | None = None
+    """Directions u, v of a lean in these coordinates, shape (2, 3)."""
+
+
+def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarray | None = None) -> Reference:
+    """
+    Return the readings of a perfect sensor at the reference point of the mount.
+
+    From link to link, with C the inverse of the joint's turn, a its axis, r the step to its origin and q its angle::
+
+        force' = C (force + alpha x r + omega x (omega x r)),   omega' = C omega + a q',
+        alpha' = C alpha + a q'' + (C omega) x a q'
+
+    and for a joint that has slid by q, after the step r::
+
+        force' = force + alpha x a q + omega x (omega x a q) + 2 omega x a q' + a q''
+
+    starting at the base with gravity (upwards) and, when latitude and azimuth are known, the Earth's rate.
+
+    Parameters
+    ----------
+    table : Table
+        The chain.
+    motion : JointMotion
+        Joints at the instants wanted, columns in the order of ``table.joint_names``.
+    temperature_c : array, shape (n,), optional
+        Passed on.
+
+    Returns
+    -------
+    Reference
+
+    """
+    n_samples = len(motion.time)
+    mat_sn, force_s = np.empty((n_samples, 3, 3)), np.empty((n_samples, 3))
+    rate_s, alpha_s = np.empty((n_samples, 3)), np.empty((n_samples, 3))
+    constants = _constants(table)
+    steps = _chain_steps(constants, motion)
+    for start in range(0, n_samples, _BLOCK):
+        part = slice(start, min(start + _BLOCK, n_samples))
+        columns = _run_chain(constants.base, motion, steps, part)
+        mat_sn[part] = columns[:, :3].transpose(2, 0, 1)
+        rate_s[part], alpha_s[part], force_s[part] = columns[:, 3].T, columns[:, 4].T, columns[:, 5].T
+    return Reference(time=motion.time, mat_sn=mat_sn, force_s=force_s, rate_s=rate_s, alpha_s=alpha_s, gravity=constants.gravity,
+                     temperature_c=temperature_c, branch=motion.thermal_branch, shaking=motion.vibration, motion=motion)
+
+
+def _chain_steps(constants, motion):
+    """Return the `_Step`s; joints at rest are merged into the constant matrix and the offset of the next one."""
+    steps, matrix, offset = [], np.eye(3), np.zeros(3)
+    for link in constants.links:
+        offset = offset + matrix.T @ link.xyz
+        matrix = link.mat_in @ matrix
+        if not link.leans and not _moves(motion, link.column):
+            at = link.plus + (link.multiplier * motion.position[0, link.column] if len(motion.time) else 0.0)
+            if link.turns:
+                matrix = rotation(-at * link.axis) @ matrix
+            else:
+                offset = offset + matrix.T @ (at * link.axis)
+            continue
+        before, sense, third = _to_coordinate_axis(link.axis) if link.turns else (np.eye(3), 1.0, 2)
+        steps.append(_Step(offset, before @ matrix, link, sense, third, link.across @ before.T))
+        matrix, offset = before.T, np.zeros(3)
+    return [*steps, _Step(offset + matrix.T @ constants.mount_xyz, constants.mat_sl @ matrix, None)]
+
+
+def _moves(motion, column):
+    position = motion.position[:, column]
+    still = len(position) == 0 or (np.all(position == position[0]) and not motion.rate[:, column].any()
+                                   and not motion.acceleration[:, column].any())
+    return not still
+
+
+def _to_coordinate_axis(axis):
+    """Return (matrix, sense, index) with ``matrix @ axis = sense * e_index``; the identity where the axis is one already."""
+    third = int(np.argmax(np.abs(axis)))
+    if np.abs(axis[third]) == 1.0:
+        return np.eye(3), float(np.sign(axis[third])), third
+    return align(axis), 1.0, 2
+
+
+class _Constants(NamedTuple):
+    """Interface of a table for the recursion."""
+
+    base: np.ndarray
+    """`_base_columns`."""
+    links: tuple
+    mount_xyz: np.ndarray
+    mat_sl: np.ndarray
+    gravity: float
+
+
+@lru_cache(maxsize=512)
+def _constants(table):
+    """Return the `_Constants`: thousands of short windows share one table."""
+    columns = {name: column for column, name in enumerate(table.joint_names)}
+    links = tuple(_Link(np.array(joint.axis), np.array(joint.xyz), joint.mat_before.T, joint.turns, columns[joint.source],
+                        *((1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset)),
+                        joint.sag, joint.wobble, axis_error_directions(np.array(joint.axis))) for joint in table.joints)
+    mount_xyz = np.zeros(3) if table.mount_xyz is None else np.array(table.mount_xyz)
+    constants = _Constants(_base_columns(table), links, mount_xyz, table.mat_sl, table.gravity_value)
+    for array in (constants.base, constants.mount_xyz, constants.mat_sl, *(part for link in links for part in (*link[:3], link.across))):
+        array.flags.writeable = False
+    return constants
+
+
+def _base_columns(table):
+    """Return mat_bn (three columns), rate, angular acceleration and specific force of the base, in the base frame, shape (3, 6, 1)."""
+    columns = np.zeros((3, 6, 1))
+    mat_bn = table.mat_nb.T
+    columns[:, :3, 0] = mat_bn
+    if table.latitude is not None and table.azimuth_deg is not None:
+        columns[:, 3, 0] = mat_bn @ earth_rate_n(table.latitude, table.azimuth_n_deg)
+    columns[:, 5, 0] = table.gravity_value * mat_bn[:, 2]
+    return columns
+
+
+def _run_chain(columns, motion, steps, part):
+    """Return the columns of `_base_columns` at the sensor, in its frame, shape (3, 6, n)."""
+    for step in steps:
+        if step.offset.any():
+            columns = columns.copy()
+            columns[:, 5] += _arm_force(columns[:, 3], columns[:, 4], step.offset[:, None])
+        if not np.array_equal(step.matrix, np.eye(3)):
+            columns = np.tensordot(step.matrix, columns, 1)
+        if step.link is not None:
+            columns = _move(columns, step, motion, part)
+    return np.broadcast_to(columns, (3, 6, part.stop - part.start))
+
+
+def _move(columns, step, motion, part):
+    """Bring `columns` past a joint that moves."""
+    link = step.link
+    factor = step.sense * link.multiplier
+    position, rate, acceleration = (factor * values[part, link.column] for values in (motion.position, motion.rate, motion.acceleration))
+    position += step.sense * link.plus
+    if link.turns:
+        if link.leans:
+            columns = _lean(columns, step, *(step.sense * values for values in (position, rate, acceleration)))
+        return _turn(columns, step.third, position, rate, acceleration)
+    return _slide(columns, link.axis[:, None], position, rate, acceleration)
+
+
+def _lean(columns, step, angle, rate, acceleration):
+    """Bring `columns` into the frame of a joint whose axis sags and wobbles, by two small turns across it; the joint is at `angle`."""
+    link, first, second = step.link, (step.third + 1) % 3, (step.third + 2) % 3
+    vector = np.zeros((3, 3, len(angle)))   # derivative, direction, sample
+    if link.wobble:
+        lean = wobble_at(link.wobble, angle, rate, acceleration=acceleration)
+        vector += np.einsum('dn,k->dkn', lean.real, step.across[0]) + np.einsum('dn,k->dkn', lean.imag, step.across[1])
+    if link.sag:
+        up, spin, alpha = columns[:, 2], columns[:, 3], columns[:, 4]
+        moves = _cross(up, spin)   # up is fixed in space; the rotation of the Earth is negligible relative to the sag
+        axis = np.zeros((3, 1))
+        axis[step.third] = step.sense * link.sag
+        vector += np.stack([_cross(each, axis) for each in (up, moves, _cross(moves, spin) + _cross(up, alpha))])
+    for which in (first, second):
+        columns = _turn(columns, which, *vector[:, which])
+    return columns
+
+
+def _arm_force(rate, alpha, arm):
+    """Return ``alpha x arm + rate x (rate x arm)``, all shape (3, n) or (3, 1)."""
+    return _cross(alpha, arm) + rate * (rate * arm).sum(axis=0) - arm * (rate * rate).sum(axis=0)
+
+
+def _cross(first, second):
+    """Return the cross product of vectors, shape (3, n)."""
+    return np.stack([first[1] * second[2] - first[2] * second[1], first[2] * second[0] - first[0] * second[2],
+                     first[0] * second[1] - first[1] * second[0]])
+
+
+def _slide(columns, axis, position, rate, acceleration):
+    """Bring `columns` into the link that slides along `axis`, shape (3, 1)."""
+    slid = np.array(np.broadcast_to(columns, columns.shape[:2] + (len(position),)))
+    spin, alpha = slid[:, 3], slid[:, 4]
+    slid[:, 5] += _arm_force(spin, alpha, axis * position) + 2 * rate * _cross(spin, axis) + axis * acceleration
+    return slid
+
+
+def _turn(columns, third, angle, rate, acceleration):
+    """Bring `columns` into the link that turns about coordinate axis `third` and add the joint's own motion."""
+    first, second = (third + 1) % 3, (third + 2) % 3
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = np.empty(columns.shape[:2] + (len(angle),))
+    turned[first] = cos * columns[first]
+    turned[first] += sin * columns[second]
+    turned[second] = cos * columns[second]
+    turned[second] -= sin * columns[first]
+    turned[third] = columns[third]
+    turned[first, 4] += turned[second, 3] * rate
+    turned[second, 4] -= turned[first, 3] * rate
+    turned[third, 3] += rate
+    turned[third, 4] += acceleration
+    return turned

@@ -1,0 +1,276 @@
+"""Joints brought to the IMU's stamps: a smooth curve through the readings, its motion, and small errors of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import vstack
+
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.settings import setting
+from imu_calibration.kinematics.joint_motion import JointMotion, encoder_step
+from imu_calibration.kinematics.smoothing import (
+    Knots,
+    PenalisedSpline,
+    Smooth,
+    design_matrix,
+    design_values,
+    evaluate_pieces,
+    normal_bands,
+    piece_coefficients,
+    smooth,
+)
+
+
+class JointRows:
+    """Rows of the design at the stamps, for positions and velocities."""
+
+    def __init__(self, knots: Knots, time: np.ndarray):
+        self.knots, self.time = knots, time
+        self._position = self._make(0)
+
+    def _make(self, derivative, weight=None):
+        interval, values = design_values(self.knots, self.time, derivative)
+        if weight is not None:
+            values = values * weight
+        return design_matrix(self.knots, interval, values), normal_bands(self.knots, interval, values)
+
+    def positions(self) -> PenalisedSpline:
+        """Return the least squares of positions only."""
+        return PenalisedSpline(*self._position)
+
+    def both(self, weight: np.ndarray) -> PenalisedSpline:
+        """Return the least squares of positions, and below them velocities times `weight`."""
+        design, bands = self._make(1, weight)
+        return PenalisedSpline(vstack([self._position[0], design], format='csr'), self._position[1] + bands, n_kinds=2)
+
+
+def fit_with_velocity(rows: JointRows, fit: Smooth, position: np.ndarray, *, velocity: np.ndarray, trend: 'Trend',
+                      settings: 'JointSettings') -> tuple[bool, Smooth]:
+    """Return whether the velocities agree with the fit to the positions, and a fit to both when it is better for them."""
+    pieces = piece_coefficients(fit.coefficients[:, None])
+    trend.add_to(pieces, rows.knots)
+    _, rate, acceleration = evaluate_pieces(rows.knots, pieces, rows.time, derivatives=2)[:, :, 0]
+    trusted, velocity_sd = check_velocity(velocity, rate, acceleration, dof=fit.dof, settings=settings)
+    # Information of velocities at the edge of the band, relative to positions.
+    if not trusted or fit.noise_sd * fit.bandwidth / rows.knots.step < 0.3 * velocity_sd:
+        return trusted, fit
+    weight = np.where(np.isfinite(velocity), fit.noise_sd / velocity_sd, 0.0)
+    rest = position - trend.at(rows.time)[:, 0], weight * (np.nan_to_num(velocity) - trend.at(rows.time, 1)[:, 0])
+    better, = smooth(rows.both(weight), np.concatenate(rest)[:, None], [fit.noise_sd], robustness=settings.robustness)
+    return trusted, better
+
+
+@dataclass(frozen=True, eq=False)
+class Trend:
+    """Parabolas, which the penalty does not constrain; removed first to reduce rounding."""
+
+    centre: float
+    """Origin of their time, s."""
+    factors: np.ndarray
+    """Coefficients of the powers of time, shape (3, n_joints)."""
+
+    @classmethod
+    def through(cls, time: np.ndarray, position: np.ndarray, still: np.ndarray) -> 'Trend':
+        """Return the parabolas of least squares (of lower degree for few stamps); constants for joints that are `still`."""
+        centre = 0.5 * (time[0] + time[-1])
+        degree = min(2, len(np.unique(time)) - 1)
+        scale = max(time[-1] - centre, 1e-9) ** np.arange(degree + 1)
+        powers = np.vander(time - centre, degree + 1, increasing=True) / scale
+        factors = np.zeros((3, position.shape[1]))
+        factors[:degree + 1] = np.linalg.solve(powers.T @ powers, powers.T @ position) / scale[:, None]
+        factors[:, still] = np.array([[1.0], [0.0], [0.0]]) * position[0, still]
+        return cls(centre, factors)
+
+    def column(self, joint: int) -> 'Trend':
+        """Return the parabola of one joint."""
+        return Trend(self.centre, self.factors[:, joint:joint + 1])
+
+    def at(self, time: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """Return values or rates, shape (n, n_joints)."""
+        time = (time - self.centre)[:, None]
+        if derivative:
+            return self.factors[1] + 2 * time * self.factors[2]
+        return self.factors[0] + time * (self.factors[1] + time * self.factors[2])
+
+    def add_to(self, pieces: np.ndarray, knots: Knots) -> None:
+        """Add the parabolas to the polynomials between the knots, in place."""
+        starts = knots.start + knots.step * np.arange(knots.n_intervals)
+        pieces[0] += self.at(starts)
+        pieces[1] += knots.step * self.at(starts, 1)
+        pieces[2] += knots.step ** 2 * self.factors[2]
+
+
+@dataclass(frozen=True)
+class JointSettings:
+    """How the joints' motion is drawn from their readings."""
+
+    robustness: float = setting(0.7, '1', 'guard against rough fits when the smoothing is chosen; 1 is plain cross-validation', (0.05, 1.0),
+                                'too large: rough accelerations now and then; too small: sharp ramps are rounded')
+    velocity_scale: float = setting(2e-3, '1', 'joint velocities are used when their scale agrees with the positions to this', (0.0, 0.1),
+                                    'too large: filtered velocities distort the reference')
+    velocity_lag: float = setting(2e-4, 's', 'joint velocities are used if their lag behind the positions is below this', (0.0, 0.1),
+                                  'too large: late velocities imitate a time offset of the IMU')
+
+
+def check_velocity(velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, *, dof: float,
+                   settings: JointSettings) -> tuple[bool, float]:
+    """
+    Compare a joint's velocities with the derivative of its positions, ``velocity = offset + scale rate - lag acceleration + noise``.
+
+    Parameters
+    ----------
+    velocity : array, shape (n,)
+        Velocities of the joint states, rad/s; NaN where there is none.
+    rate, acceleration : array, shape (n,)
+        Derivatives of the smooth curve through the positions at the same stamps.
+    dof : float
+        Effective number of parameters of that curve: so many of its values are independent.
+    settings : JointSettings
+        Largest disagreement, which must be excluded by two standard errors.
+
+    Returns
+    -------
+    trusted : bool
+        Whether scale, lag and offset agree; false if the motion is too weak for the test.
+    noise_sd : float
+        Scatter of the velocities, rad/s, that of the curve included.
+
+    """
+    good = np.isfinite(velocity)
+    if good.mean() < 0.9 or not np.any(velocity[good]):
+        return False, np.inf
+    columns = np.stack([np.ones(good.sum()), rate[good], -acceleration[good]], axis=1)
+    size = np.sqrt(np.mean(columns ** 2, axis=0))
+    if size.min() < 1e-12:
+        return False, np.inf
+    normal = np.linalg.pinv((columns / size).T @ (columns / size))
+    estimate = normal @ ((columns / size).T @ velocity[good]) / size
+    noise_sd = np.sqrt(np.mean((velocity[good] - columns @ estimate) ** 2))
+    error = noise_sd * np.sqrt(np.diag(normal) * good.sum() / max(dof, 4.0)) / size
+    limit = np.array([settings.velocity_scale * size[1], settings.velocity_scale, settings.velocity_lag])
+    return bool(np.all(np.abs(estimate - [0.0, 1.0, 0.0]) + 2 * error < limit)), float(noise_sd)
+
+
+_MINIMUM_SAMPLES = 8  # fewer stamps are fitted with a parabola
+_MARGIN = 3  # knots beyond the readings
+_LONGEST_HOLE = 300  # periods; a longer one cannot be bridged by anything sensible
+
+
+@dataclass(frozen=True, eq=False)
+class JointCurve:
+    """Smooth motion of the joints over a stretch of time."""
+
+    knots: Knots
+    """Knots of the quintic spline."""
+    pieces: np.ndarray
+    """Polynomials between the knots, shape (6, n_intervals, n_joints)."""
+    noise_sd: np.ndarray
+    """Noise of the positions, rad, shape (n_joints,): estimated from the residuals, at least the known noise of the encoder."""
+    velocity_trusted: np.ndarray
+    """Whether the velocities agree with the positions, shape (n_joints,)."""
+    bandwidth: np.ndarray
+    """Frequency that passes at half its amplitude, Hz, shape (n_joints,); zero for a joint at rest."""
+
+    def at(self, time: np.ndarray, derivatives: int = 3) -> JointMotion:
+        """
+        Return the `JointMotion` at `time`, shape (n,); NaN outside the readings by more than three of their periods.
+
+        Derivatives above `derivatives` are left out as zero.
+        """
+        time = np.asarray(time, float)
+        values = np.zeros((4, len(time), self.pieces.shape[2]))
+        values[:derivatives + 1] = evaluate_pieces(self.knots, self.pieces, time, derivatives=derivatives)
+        outside = (time < self.knots.start) | (time > self.knots.start + self.knots.step * self.knots.n_intervals)
+        if outside.any():
+            values[:, outside] = np.nan
+        return JointMotion(time, *values)
+
+
+def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray | None = None, *,
+                    noise_sd: np.ndarray | float | None = None,
+                    settings: JointSettings = JointSettings()) -> JointCurve:
+    """
+    Return the smooth curve through readings of the joints.
+
+    A penalised quintic spline per joint, one knot per reading; the penalty follows from the data (`smoothing.smooth`), so
+    that readings without noise are interpolated and those of a coarse encoder give sane accelerations. Velocities that
+    agree with the positions in scale and lag are used.
+
+    Parameters
+    ----------
+    time : array, shape (n,)
+        Seconds, not decreasing; repeats, jitter and small gaps are fine.
+    position : array, shape (n, n_joints)
+        Joint angles, rad; jumps by whole turns are undone.
+    velocity : array, shape (n, n_joints), optional
+        Joint rates, rad/s; NaN where there is none.
+    noise_sd : float or array, shape (n_joints,), optional
+        Noise that the positions have at least, rad.
+    settings : JointSettings, optional
+        Adjustable numbers.
+
+    Returns
+    -------
+    JointCurve
+
+    Raises
+    ------
+    InputError
+        When there are no readings, a position is not finite, time runs backwards or has a hole of many periods.
+
+    """
+    time, position = np.asarray(time, float), np.asarray(position, float)
+    _check(time, position)
+    position = _unwrapped(position)
+    stamps = time[np.concatenate([[True], np.diff(time) > 0])]
+    knots = _place_knots(stamps)
+    still = np.all(position == position[0], axis=0)
+    floor = _noise_floor(position, noise_sd)
+    trend = Trend.through(time, position, still)
+    coefficients = np.zeros((knots.n_coefficients, position.shape[1]))
+    bandwidth, trusted = np.zeros(position.shape[1]), np.zeros(position.shape[1], bool)
+    noise = floor.copy()
+    moving = np.flatnonzero(~still).tolist()
+    if len(stamps) >= _MINIMUM_SAMPLES and len(moving):
+        rows = JointRows(knots, time)
+        fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving], robustness=settings.robustness)
+        for joint, fit in zip(moving, fits, strict=True):
+            noise[joint] = max(floor[joint], fit.noise_sd)
+            if velocity is not None:
+                trusted[joint], fit = fit_with_velocity(rows, fit, position[:, joint], velocity=velocity[:, joint],
+                                                        trend=trend.column(joint), settings=settings)
+            coefficients[:, joint], bandwidth[joint] = fit.coefficients, fit.bandwidth / (2 * np.pi * knots.step)
+    pieces = piece_coefficients(coefficients)
+    trend.add_to(pieces, knots)
+    return JointCurve(knots, pieces, noise, trusted, bandwidth)
+
+
+def _check(time, position):
+    if not len(time) or not np.isfinite(position).all():
+        raise InputError(f'joint positions must be finite, got {len(time)} readings with gaps or none; remove non-finite values',
+                         code='not_finite')
+    if np.any(np.diff(time) < 0):
+        raise InputError('joint stamps must not run backwards, got a backward step; sort the readings or drop those',
+                         code='stamps_backwards')
+
+
+def _unwrapped(position):
+    return np.unwrap(position, axis=0) if np.any(np.abs(np.diff(position, axis=0)) > np.pi) else position
+
+
+def _place_knots(time):
+    """Return knots at the usual distance of the stamps (increasing), with a margin on both sides."""
+    stride = min(8, len(time) - 1)
+    step = float(np.median(time[stride:] - time[:-stride]) / stride) if stride else 1e-6
+    hole = np.max(np.diff(time), initial=0.0)
+    if hole > _LONGEST_HOLE * step:
+        raise InputError(f'joint readings must follow each other within {_LONGEST_HOLE} periods, got a hole of {hole:.3g} s; '
+                         'split them there', code='gap')
+    return Knots(float(time[0] - _MARGIN * step), step, int(np.ceil((time[-1] - time[0]) / step)) + 2 * _MARGIN)
+
+
+def _noise_floor(position, noise_sd):
+    """Return the lower limit of the noise of the readings: the given value, rounding, coarse steps."""
+    floor = 4 * np.finfo(float).eps * np.abs(position).max(axis=0)
+    steps = np.array([encoder_step(column) for column in position.T])
+    return np.maximum.reduce([floor, steps / np.sqrt(12), np.broadcast_to(0.0 if noise_sd is None else noise_sd, floor.shape)])

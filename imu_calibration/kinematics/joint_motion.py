@@ -1,0 +1,181 @@
+"""The joints' motion at given instants (angles and three derivatives), errors of angle encoders, and the motion at shifted times."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from math import factorial
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """Angles of the joints and their first three derivatives; columns in the order of the table's joints."""
+
+    time: np.ndarray
+    """Seconds, shape (n,)."""
+    position: np.ndarray
+    """Joint angles, rad, shape (n, n_joints)."""
+    rate: np.ndarray
+    """First derivative, rad/s, shape (n, n_joints)."""
+    acceleration: np.ndarray
+    """Second derivative, rad/s^2, shape (n, n_joints)."""
+    jerk: np.ndarray
+    """Third derivative, rad/s^3, shape (n, n_joints)."""
+    thermal_branch: np.ndarray | None = None
+    """Thermal branch at these instants (`kinematics.signal_history`), shape (n,); None: unknown."""
+    vibration: np.ndarray | None = None
+    """Variance of vibration (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3); None: unknown."""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def select(self, index: np.ndarray | slice) -> 'JointMotion':
+        """Return the motion at `index` (slice, mask or integer array)."""
+        known = {f.name: getattr(self, f.name) for f in fields(self)}
+        selected: dict[str, Any] = {name: None if values is None else values[index] for name, values in known.items()}
+        return JointMotion(**selected)
+
+    @classmethod
+    def joined(cls, parts: Sequence['JointMotion']) -> 'JointMotion':
+        """Return consecutive motions; a quantity that one of them lacks is unknown."""
+        columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(cls)}
+        joined: dict[str, Any] = {name: None if any(each is None for each in some) else np.concatenate(some)
+                                  for name, some in columns.items()}
+        return cls(**joined)
+
+
+def with_encoder_harmonics(motion: JointMotion, order: int, cos_amplitude: np.ndarray, *, sin_amplitude: np.ndarray) -> JointMotion:
+    """
+    Return the true motion behind encoders with a harmonic error, ``q_true = q + c cos(k q) + s sin(k q)``.
+
+    Rates, accelerations and jerks are the exact derivatives.
+
+    Parameters
+    ----------
+    motion : JointMotion
+        Motion measured by the encoders.
+    order : int
+        Periods per turn, k.
+    cos_amplitude, sin_amplitude : array, shape (n_joints,)
+        Amplitudes c and s, rad.
+
+    """
+    cos_amplitude, sin_amplitude = (np.broadcast_to(np.asarray(a, float), motion.position.shape[1:]) for a in (cos_amplitude,
+                                                                                                               sin_amplitude))
+    wrong = np.flatnonzero((cos_amplitude != 0) | (sin_amplitude != 0))
+    if not len(wrong):
+        return motion
+    phase, rate, acceleration = order * motion.position[:, wrong], motion.rate[:, wrong], motion.acceleration[:, wrong]
+    cos, sin = np.cos(phase), np.sin(phase)
+    error = cos_amplitude[wrong] * cos + sin_amplitude[wrong] * sin
+    slope = order * (sin_amplitude[wrong] * cos - cos_amplitude[wrong] * sin)
+    curvature, third = -order ** 2 * error, -order ** 2 * slope
+    moved = {name: getattr(motion, name).copy() for name in ('position', 'rate', 'acceleration', 'jerk')}
+    moved['position'][:, wrong] += error
+    moved['rate'][:, wrong] *= 1 + slope
+    moved['acceleration'][:, wrong] = acceleration * (1 + slope) + curvature * rate ** 2
+    moved['jerk'][:, wrong] = motion.jerk[:, wrong] * (1 + slope) + 3 * curvature * rate * acceleration + third * rate ** 3
+    return replace(motion, **moved)
+
+
+def encoder_step(position: np.ndarray) -> float:
+    """
+    Return the resolution of an encoder that shows in its readings, or 0.
+
+    Looks at isolated jumps, those between readings that repeat; they are one step high. Readings that move by many steps
+    from sample to sample have none; their quantisation is white and needs no notice.
+    """
+    change = np.diff(position)
+    moved = change != 0
+    isolated = np.abs(change[1:-1][moved[1:-1] & ~moved[:-2] & ~moved[2:]])
+    if not len(isolated):
+        return 0.0
+    step = np.median(isolated)
+    return float(step) if np.mean(np.abs(isolated / step - 1) < 0.15) > 0.8 else 0.0
+
+
+LINKED = 0.1
+"""Largest distance of stamps for interpolation, s; stamps further apart belong to different windows or rests."""
+
+BLOCK = 4096
+"""Rows per block, so that they fit in the processor's cache."""
+
+
+def shifted(motion: JointMotion, delay: float | np.ndarray) -> JointMotion:
+    """
+    Return the motion at ``time - delay``, with unchanged `time`: the motion of the IMU if its stamps are `delay` late.
+
+    Between two stamps the polynomial of degree seven that meets position, rate, acceleration and jerk at both (Hermite), so that
+    the error does not grow with the delay: 1e-4 of the acceleration at a quarter of the stamps' frequency. Before the first of a run of
+    stamps and after the last, the Taylor series from there, with the jerk as the last derivative.
+
+    Parameters
+    ----------
+    motion : JointMotion
+        Motion at the stamps.
+    delay : float or array, shape (n,)
+        Delay of all stamps, or of each, s; positive if the stamps of the IMU are late.
+
+    """
+    if not np.any(delay) or not len(motion):
+        return motion
+    delay = np.broadcast_to(np.asarray(delay, float), motion.time.shape)
+    derivatives = np.stack([motion.position, motion.rate, motion.acceleration, motion.jerk])
+    step = np.diff(motion.time)
+    if len(motion) < 2 or np.any(step <= 0):
+        moved = _taylor(derivatives, -delay[:, None])
+    else:
+        target, moved = motion.time - delay, np.empty_like(derivatives)
+        for first in range(0, len(target), BLOCK):
+            rows = slice(first, first + BLOCK)
+            moved[:, rows] = _interpolated(motion.time, step, derivatives, target[rows], delay[rows] > 0)
+    return replace(motion, position=moved[0], rate=moved[1], acceleration=moved[2], jerk=moved[3])
+
+
+def _interpolated(time, step, derivatives, target, backwards):
+    right = np.clip(np.searchsorted(time, target, side='right'), 1, len(time) - 1)
+    inside = (step[right - 1] <= LINKED) & (target >= time[right - 1]) & (target <= time[right])
+    start = right[inside] - 1
+    ends = (derivatives.take(at, axis=1) for at in (start, start + 1))
+    between = _hermite(*ends, step[start, None], (target[inside] - time[start])[:, None])
+    if inside.all():
+        return between
+    moved = np.empty((4, len(target), derivatives.shape[2]))
+    moved[:, inside] = between
+    beyond = np.flatnonzero(~inside)
+    # The end of the run that contains the stamp: an isolated stamp, of a rest, is its own run.
+    before, after = (np.searchsorted(time, target[beyond], side=side) for side in ('left', 'right'))
+    base = np.clip(np.where(backwards[beyond], before, after - 1), 0, len(time) - 1)
+    moved[:, beyond] = _taylor(derivatives[:, base], (target[beyond] - time[base])[:, None])
+    return moved
+
+
+def _taylor(derivatives, by):
+    """Return value and first three derivatives at a distance `by`."""
+    position, rate, acceleration, jerk = derivatives
+    return np.stack([position + by * (rate + by / 2 * (acceleration + by / 3 * jerk)), rate + by * (acceleration + by / 2 * jerk),
+                     acceleration + by * jerk, jerk])
+
+
+_POWERS = np.array([[factorial(power) / factorial(power - order) for power in range(4, 8)] for order in range(4)])
+"""Derivatives of u^4 ... u^7 at u = 1."""
+_FROM_ENDS = np.linalg.inv(_POWERS)
+
+
+def _hermite(left, right, step, by):
+    """Return value and first three derivatives, shape (4, m, n_joints), at `by` from the left end of intervals of length `step`, (m, 1)."""
+    scale = np.stack([step**0, step, step**2, step**3])
+    left = scale * left
+    # The powers four to seven correct the error of the left-end cubic at the right end.
+    upper = np.tensordot(_FROM_ENDS, scale * right - _taylor(left, 1.0), 1)
+    coefficients = [left[0], left[1], left[2] / 2, left[3] / 6, *upper]
+    u, found = by / step, np.empty_like(left)
+    for order in range(4):
+        total = found[order]
+        total[:] = coefficients[7]
+        for power in range(6, order - 1, -1):
+            total *= u
+            total += coefficients[power]
+        coefficients = [coefficients[0]] * (order + 1) + [(power - order) * coefficients[power] for power in range(order + 1, 8)]
+    return found / scale

@@ -1,0 +1,164 @@
+"""Range, speed and acceleration of the driven joints, as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.core.constants import DEG
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.joint import Joint
+from imu_calibration.kinematics.table import Table
+
+USUAL = {True: (150.0 * DEG, 300.0 * DEG), False: (0.25, 0.5)}
+"""Default speed and acceleration of rotating and of sliding joints: rad/s, rad/s^2; m/s, m/s^2."""
+NOT_CHECKED = 'only the limits of the joints are checked, not collisions of the robot with itself, its surroundings or its cables'
+"""Stated wherever a plan is printed, saved or driven."""
+DEFAULT, ROBOT, TABLE = 'default', 'robot description', 'table file'
+"""Origins of limits; default: no description gives it."""
+RADIANS = 2 * np.pi
+"""A range in degrees with smaller ends is probably in radians."""
+WIDEST = 20 * np.pi
+"""A range of ten turns in a robot description is probably in degrees, rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionLimits:
+    """Limits of the joints that are driven, in the order of ``table.joint_names``: rad and m, each shape (n_joints,)."""
+
+    lower: np.ndarray
+    """Smallest positions, minus infinity where there is no end."""
+    upper: np.ndarray
+    """Largest positions."""
+    speed: np.ndarray
+    """Largest speeds."""
+    acceleration: np.ndarray
+    """Largest accelerations."""
+    turns: np.ndarray
+    """True for joints that turn."""
+    origins: tuple[tuple[str, str, str], ...] = ()
+    """Per joint: origin of range, speed and acceleration."""
+
+    def __len__(self) -> int:
+        return len(self.lower)
+
+    @property
+    def endless(self) -> np.ndarray:
+        """True for joints that may turn on and on."""
+        return self.turns & ~np.isfinite(self.lower)
+
+    def wound(self, position: np.ndarray, turns: float) -> 'MotionLimits':
+        """Return the limits with endless joints restricted to so many turns to either side of a position; zero turns: unrestricted."""
+        return self.around(position, np.where(self.endless, 2 * np.pi * turns, np.inf)) if turns else self
+
+    def around(self, position: np.ndarray, reach: np.ndarray) -> 'MotionLimits':
+        """
+        Return the limits restricted to a neighbourhood of a position.
+
+        Parameters
+        ----------
+        position, reach : ndarray, shape (n_joints,)
+            Center and distance to either side, rad or m.
+
+        Raises
+        ------
+        InputError
+            When the position is outside the limits.
+
+        """
+        lower, upper = np.maximum(self.lower, position - reach), np.minimum(self.upper, position + reach)
+        if np.any(lower > upper):
+            raise InputError(f'the pose must lie within the range of every joint, joint number {int(np.argmax(lower - upper)) + 1} is '
+                             'outside; choose another pose')
+        return replace(self, lower=lower, upper=upper)
+
+    def reached(self, position: np.ndarray, reach_deg: float) -> 'MotionLimits':
+        """Return the limits with rotating joints restricted to `reach_deg` on either side of a position; sliding joints do not change."""
+        return self.around(position, np.where(self.turns, reach_deg * DEG, 0.0))
+
+    def hold(self, position: np.ndarray, margin: float = 1e-9) -> bool:
+        """Whether every position, shape (..., n_joints), lies within the range."""
+        return bool(np.all(position >= self.lower - margin) and np.all(position <= self.upper + margin))
+
+
+def free_limits(n_joints: int) -> MotionLimits:
+    """Return the limits of joints that turn without end at the usual speed."""
+    whole, (speed, acceleration) = np.full(n_joints, np.inf), USUAL[True]
+    return MotionLimits(-whole, whole, np.full(n_joints, speed), np.full(n_joints, acceleration), np.ones(n_joints, bool))
+
+
+def limits_of(table: Table) -> MotionLimits:
+    """
+    Return the limits of a table's joints.
+
+    A joint that other joints mimic keeps their limits as well. Defaults: `USUAL` speed and acceleration, no end for a joint that turns, no
+    motion for a joint that slides; `missing_ranges` lists the joints without a range.
+    """
+    names = table.joint_names
+    turns = np.ones(len(names), bool)
+    lower, upper, fastest = np.full(len(names), -np.inf), np.full(len(names), np.inf), np.full((2, len(names)), np.inf)
+    origins = [[DEFAULT] * 3 for _ in names]
+    # A joint's own entry is last, so that a follower does not determine its type.
+    for joint in sorted(table.joints, key=lambda joint: joint.mimic is None):
+        column, limits = names.index(joint.source), joint.limits
+        turns[column] = joint.turns
+        factor, offset = (1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset)
+        if factor and limits.lower is not None and limits.upper is not None:
+            ends = sorted(((limits.lower - offset) / factor, (limits.upper - offset) / factor))
+            if ends[0] > lower[column] or ends[1] < upper[column]:
+                origins[column][0] = _origin(joint, 'lower')
+            lower[column], upper[column] = max(lower[column], ends[0]), min(upper[column], ends[1])
+        elif limits.endless and joint.mimic is None and not np.isfinite(lower[column]):
+            origins[column][0] = _origin(joint, 'endless')
+        given = [np.inf if value is None or not factor else value / abs(factor) for value in (limits.speed, limits.acceleration)]
+        for row, (value, key) in enumerate(zip(given, ('speed', 'acceleration'), strict=True)):
+            if value < fastest[row, column]:
+                fastest[row, column], origins[column][row + 1] = value, _origin(joint, key)
+    usual = np.array([USUAL[bool(turning)] for turning in turns]).T
+    stuck = ~turns & ~np.isfinite(lower)
+    lower[stuck] = upper[stuck] = 0.0
+    speed, acceleration = np.where(np.isfinite(fastest), fastest, usual)
+    return MotionLimits(lower, upper, speed, acceleration, turns, tuple((a, b, c) for a, b, c in origins))
+
+
+def _origin(joint: Joint, name: str) -> str:
+    where = ROBOT if name in joint.limits.described else TABLE
+    return where if joint.mimic is None else f'{where}, joint {joint.name}'
+
+
+def missing_ranges(table: Table) -> tuple[str, ...]:
+    """Return the joints whose range is unknown or implausibly wide: neither a plausible range nor declared endless."""
+    limits = limits_of(table)
+    wide = limits.turns & np.isfinite(limits.lower) & (limits.upper - limits.lower > WIDEST)
+    return tuple(name for name, origin, is_wide in zip(table.joint_names, limits.origins, wide, strict=True)
+                 if origin[0] == DEFAULT or (is_wide and origin[0].startswith(ROBOT)))
+
+
+def range_warnings(table: Table) -> list[str]:
+    """Return one line on joints without a range, and one per range whose unit is doubtful."""
+    lines, missing = [], missing_ranges(table)
+    if missing:
+        lines.append(f'every joint must have a range to be moved, {", ".join(missing)}: none, or over ten turns; add range_deg: [a, b] '
+                     '(range_m where it slides) or endless: true to the table file')
+    for joint in table.joints:
+        lower, upper = joint.limits.lower, joint.limits.upper
+        if joint.turns and lower is not None and upper is not None and 'lower' not in joint.limits.described:
+            ends = np.degrees((lower, upper))
+            if 0 < np.max(np.abs(ends)) <= RADIANS:
+                lines.append(f"range_deg of joint '{joint.name}' must be in degrees, [{ends[0]:g}, {ends[1]:g}] looks like radians; "
+                             f'write [{np.degrees(ends[0]):.1f}, {np.degrees(ends[1]):.1f}] if it is')
+    return lines
+
+
+def limit_words(table: Table, limits: MotionLimits) -> list[str]:
+    """Return range, speed and acceleration of each joint with the origin of each limit, a line per joint."""
+    lines, described = [], limits_of(table)
+    for k, (name, (of_range, of_speed, of_acceleration)) in enumerate(zip(table.joint_names, limits.origins, strict=True)):
+        factor, unit = (180 / np.pi, 'deg') if limits.turns[k] else (1.0, 'm')
+        declared = 'endless' if described.endless[k] else ''
+        ends = f'{factor * limits.lower[k]:.4g} to {factor * limits.upper[k]:.4g} {unit}' if np.isfinite(limits.lower[k]) else ''
+        text = 'no range' if of_range == DEFAULT else f'{", here ".join(filter(None, (declared, ends)))} ({of_range})'
+        lines.append(f'{name}: {text}, {factor * limits.speed[k]:.4g} {unit}/s ({of_speed}), '
+                     f'{factor * limits.acceleration[k]:.4g} {unit}/s^2 ({of_acceleration})')
+    return lines

@@ -1,0 +1,126 @@
+"""Readings of a perfect sensor by table and clock, and rotation matrices from rotation vectors and from roll, pitch and yaw."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_calibration.core.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Motion of the mount's reference point at the IMU's stamps."""
+
+    time: np.ndarray
+    """Seconds since the session's first sample, shape (n,)."""
+    mat_sn: np.ndarray
+    """Attitude, level frame to sensor frame, shape (n, 3, 3)."""
+    force_s: np.ndarray
+    """Specific force at the reference point, m/s^2, shape (n, 3)."""
+    rate_s: np.ndarray
+    """Angular rate against inertial space, rad/s, shape (n, 3); without Earth rate when latitude or azimuth is unknown."""
+    alpha_s: np.ndarray
+    """Angular acceleration, rad/s^2, shape (n, 3)."""
+    gravity: float
+    """Local gravity, m/s^2."""
+    temperature_c: np.ndarray | None = None
+    """Temperature at the samples, degrees Celsius, shape (n,)."""
+    branch: np.ndarray | None = None
+    """Thermal branch at the samples (`kinematics.signal_history`), shape (n,); None: unknown."""
+    shaking: np.ndarray | None = None
+    """Variance of vibration at the samples (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3); None: unknown."""
+    motion: Any = None
+    """The joints' motion (`JointMotion`), when there is a table."""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def thermal_branch(self) -> np.ndarray:
+        """Thermal branch in [-1, 1], shape (n,); zero, between the branches, if unknown."""
+        return np.zeros(len(self)) if self.branch is None else self.branch
+
+    @property
+    def vibration(self) -> np.ndarray:
+        """Variance of vibration, (m/s^2)^2, shape (n, 3); zero if unknown."""
+        return np.zeros((len(self), 3)) if self.shaking is None else self.shaking
+
+    @property
+    def joint_angle(self) -> np.ndarray:
+        """Angles of the joints from the base outwards, rad, shape (n, n_joints)."""
+        return self._joints.position
+
+    @property
+    def joint_rate(self) -> np.ndarray:
+        """Rates of the joints, rad/s, shape (n, n_joints)."""
+        return self._joints.rate
+
+    @property
+    def _joints(self):
+        if self.motion is None:
+            raise InputError('an effect that depends on joints needs a table or an arm, there is none; omit the effect')
+        return self.motion
+
+    def select(self, index: np.ndarray | slice) -> 'Reference':
+        """Return the reference at `index` (slice, mask or integer array)."""
+        changed = {f.name: getattr(self, f.name)[index] for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
+        if self.motion is not None:
+            changed['motion'] = self.motion.select(index)
+        return replace(self, **changed)
+
+
+def skew(vector: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return the cross-product matrices of vectors, shape (..., 3) to (..., 3, 3)."""
+    vector = np.asarray(vector, float)
+    matrix = np.zeros(vector.shape + (3,))
+    matrix[..., 0, 1], matrix[..., 0, 2] = -vector[..., 2], vector[..., 1]
+    matrix[..., 1, 0], matrix[..., 1, 2] = vector[..., 2], -vector[..., 0]
+    matrix[..., 2, 0], matrix[..., 2, 1] = -vector[..., 1], vector[..., 0]
+    return matrix
+
+
+def lever_matrix(rate_s: np.ndarray, alpha_s: np.ndarray) -> np.ndarray:
+    """
+    Return W with ``f_point = f_ref + W @ r``: ``W = [alpha x] + [omega x]^2``, shape (n, 3, 3).
+
+    Zhang 2017, eq. 11, with the dot on the tangential term that the print lost.
+    """
+    cross = skew(rate_s)
+    return skew(alpha_s) + cross @ cross
+
+
+def rotation(vector: np.ndarray) -> np.ndarray:
+    """Return ``exp(vector x)``, shape (3, 3): the turn by a rotation vector, rad."""
+    return Rotation.from_rotvec(vector).as_matrix()
+
+
+def rotation_from_rpy(rpy: np.ndarray) -> np.ndarray:
+    """Return ``Rz(yaw) Ry(pitch) Rx(roll)``, shape (3, 3): turns about fixed axes as in URDF, rad."""
+    return Rotation.from_euler('xyz', rpy).as_matrix()
+
+
+def rpy_from_rotation(matrix: np.ndarray) -> np.ndarray:
+    """
+    Return roll, pitch and yaw of a rotation matrix, rad, shape (3,): ``rotation_from_rpy`` gives the matrix back to rounding.
+
+    At a pitch of a quarter turn only one combination of roll and yaw is defined; yaw follows from the remainder (Shoemake), so
+    that their errors cancel there.
+    """
+    roll = np.arctan2(matrix[2, 1], matrix[2, 2])
+    pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[2, 1], matrix[2, 2]))
+    sin, cos = np.sin(roll), np.cos(roll)
+    return np.array([roll, pitch, np.arctan2(sin * matrix[0, 2] - cos * matrix[0, 1], cos * matrix[1, 1] - sin * matrix[1, 2])])
+
+
+def align(direction: np.ndarray) -> np.ndarray:
+    """Return the smallest rotation from the unit vector `direction` to z, shape (3, 3); half a turn about x from -z."""
+    x, y, z = direction
+    across = x * x + y * y
+    if z < 0 and across < 1e-24:
+        return np.diag([1.0, -1.0, -1.0])
+    cross = skew([y, -x, 0.0])
+    # 1 + z cancels when z is near -1.
+    return np.eye(3) + cross + cross @ cross / (1 + z if z > 0 else across / (1 - z))

@@ -1,0 +1,244 @@
+"""The turntable or arm that carries the sensor: its description, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.earth import NORMAL_GRAVITY_ACCURACY, normal_gravity
+from imu_calibration.kinematics.joint import (
+    Joint,
+    JointNames,
+    finite_number,
+    joint_from_mapping,
+    joint_to_mapping,
+    place_names,
+    require_keys,
+    three_numbers,
+    unit_vector,
+)
+from imu_calibration.kinematics.reference_motion import align, rotation_from_rpy
+
+PARALLEL = 0.02
+"""Sine of the angle up to which two axes count as parallel: their common perpendicular is undefined there."""
+
+
+class AxisAngle(NamedTuple):
+    """One angular error of an axis relative to the preceding axis."""
+
+    name: str
+    """The two joints; with u or v where the axes are parallel."""
+    joint: int
+    """Index of the joint whose axis turns."""
+    direction: np.ndarray
+    """Unit vector about which it turns, in the joint's frame, shape (3,)."""
+
+
+@lru_cache(maxsize=64)
+def axis_angles(joints: tuple[Joint, ...]) -> tuple[AxisAngle, ...]:
+    """
+    Return the angles between each turning axis and the one before it.
+
+    Two axes enclose one angle, about their common perpendicular; the other direction in which the second may stand wrong is the zero
+    of the first joint. Parallel axes have no such perpendicular: there are two angles, about `axis_error_directions`, and the zeros
+    of their joints are one (Hayati and Mirmirani 1985).
+    """
+    found, before, name = [], None, ''
+    for index, joint in enumerate(joints):
+        # The axis of the turning joint before, brought along from frame to frame with all joints at zero.
+        before = None if before is None else joint.mat_before.T @ before
+        if not joint.turns:
+            continue
+        axis = np.array(joint.axis)
+        if before is not None:
+            found += _between(f'{name}_{joint.name}', index, before, axis)
+        before, name = axis, joint.name
+    return tuple(found)
+
+
+def _between(name, index, before, axis):
+    normal = np.cross(before, axis)
+    sine = np.linalg.norm(normal)
+    if sine > PARALLEL:
+        return [AxisAngle(name, index, normal / sine)]
+    return [AxisAngle(f'{name}_{letter}', index, direction) for letter, direction in zip('uv', axis_error_directions(axis), strict=True)]
+
+
+def axis_error_directions(axis: np.ndarray) -> np.ndarray:
+    """
+    Return two unit vectors u, v that form a right-handed triad u, v, axis; shape (2, 3).
+
+    u is the coordinate axis that lies farthest from `axis` (the first of equals), made orthogonal to it; v = axis x u.
+    """
+    axis = np.asarray(axis, float)
+    start = np.eye(3)[np.argmin(np.round(np.abs(axis), 6))]
+    first = start - axis * (axis @ start)
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(axis, first)])
+
+
+_MOUNT_KEYS = ('rpy_deg', 'xyz')
+
+
+@dataclass(frozen=True)
+class Table:
+    """
+    A chain of joints that carries the sensor, and its site.
+
+    The level frame n is the base frame turned by the smallest rotation that makes `up` its z axis (half a turn about
+    the base x axis when the base hangs upside down).
+    """
+
+    joints: tuple[Joint, ...]
+    """Joints from the base outwards."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Up, a unit vector in the base frame (made unit here)."""
+    gravity: float | None = None
+    """Local gravity, m/s^2; None: WGS 84 normal gravity from latitude and height."""
+    gravity_sd: float | None = None
+    """Standard deviation of the gravity, m/s^2; None: see `gravity_sd_value`."""
+    latitude: float | None = None
+    """Geodetic latitude, degrees; None: Earth rate is not modelled."""
+    height: float | None = None
+    """Height, m; None counts as zero."""
+    azimuth_deg: float | None = None
+    """Heading of the base x axis in the horizontal, clockwise from true north (of the x axis of n when base x is vertical)."""
+    joint_noise_rad: float | None = None
+    """Noise or resolution of the encoders, rad; None: estimated from the data."""
+    joint_error_rad: float | None = None
+    """Standard deviation of zeros and axes of the joints, rad; None: exact unless their errors are requested."""
+    joint_error_m: float | None = None
+    """Standard deviation of the places of the axes, m; None: exact."""
+    mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Inner link to sensor frame, roll, pitch, yaw about fixed axes as in URDF, degrees."""
+    mount_xyz: tuple[float, float, float] | None = None
+    """Reference point in the frame of the inner link, m; None: its origin, where the axes meet."""
+
+    def __post_init__(self) -> None:
+        joints = tuple(self.joints)
+        _require_joints(joints)
+        checked: dict[str, Any] = {'joints': joints, 'up': unit_vector(self.up, 'up'),
+                                   'mount_rpy_deg': three_numbers(self.mount_rpy_deg, 'mount rpy_deg')}
+        if self.mount_xyz is not None:
+            checked['mount_xyz'] = three_numbers(self.mount_xyz, 'mount xyz')
+        for name, (low, high, advice) in _NUMBERS.items():
+            value = getattr(self, name)
+            checked[name] = None if value is None else finite_number(value, name, low, high=high, advice=advice)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        if self.gravity is None and self.latitude is None:
+            raise InputError('table: gravity or latitude must be given, got neither; '
+                             'add gravity in m/s^2, or latitude in degrees (and height)', code='gravity_missing')
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> 'Table':
+        """
+        Return the table that a mapping, as read from the table's YAML, describes.
+
+        Raises
+        ------
+        InputError
+            When a key is unknown, a joint is missing or a value does not fit.
+
+        """
+        return cls(joints=tuple(joint_from_mapping(item) for item in joint_entries(mapping)), **site_from_mapping(mapping))
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the mapping that `from_mapping` turns into an equal table."""
+        mapping = {f.name: getattr(self, f.name) for f in fields(self) if not f.name.startswith('mount_')}
+        mapping['joints'] = [joint_to_mapping(joint) for joint in self.joints]
+        mapping['up'] = list(self.up)
+        mapping['mount'] = {'rpy_deg': list(self.mount_rpy_deg), 'xyz': None if self.mount_xyz is None else list(self.mount_xyz)}
+        return mapping
+
+    @cached_property
+    def joint_names(self) -> JointNames:
+        """Names of the joints with readings, from the base outwards, and of their errors."""
+        turning = [joint.source for joint in self.joints if joint.turns]
+        # A zero that affects only the first or the last axis is the azimuth, or belongs to the mount.
+        apart = [name for name in (turning[:1] + turning[-1:]) if turning.count(name) == 1]
+        read, turning = (tuple(dict.fromkeys(names)) for names in ((joint.source for joint in self.joints), turning))
+        angles = tuple(angle.name for angle in axis_angles(self.joints))
+        places = place_names([joint.name for joint in self.joints if joint.turns])
+        return JointNames(read, turning, tuple(name for name in turning if name not in apart), angles, places,
+                          self.joint_error_rad or None, self.joint_error_m or None)
+
+    @property
+    def gravity_value(self) -> float:
+        """Local gravity, m/s^2: as given, otherwise normal gravity."""
+        return self.gravity if self.gravity is not None else normal_gravity(self.latitude, self.height or 0.0)  # type: ignore[arg-type]
+
+    @property
+    def gravity_sd_value(self) -> float:
+        """Standard deviation of `gravity_value`, m/s^2: as given; zero for a given gravity, else the accuracy of normal gravity."""
+        if self.gravity_sd is not None:
+            return self.gravity_sd
+        return 0.0 if self.gravity is not None else NORMAL_GRAVITY_ACCURACY * self.gravity_value
+
+    @property
+    def mat_nb(self) -> np.ndarray:
+        """Base frame to level frame, shape (3, 3)."""
+        return align(np.array(self.up))
+
+    @property
+    def mat_sl(self) -> np.ndarray:
+        """Frame of the last link to sensor frame, shape (3, 3): inverse of ``Rz(yaw) Ry(pitch) Rx(roll)``."""
+        return rotation_from_rpy(np.radians(self.mount_rpy_deg)).T
+
+    @property
+    def azimuth_n_deg(self) -> float | None:
+        """Heading of the x axis of n, degrees clockwise from true north, or None."""
+        return None if self.azimuth_deg is None else self.azimuth_deg + base_heading_deg(self.mat_nb)
+
+
+_NUMBERS = {
+    'gravity': (1.5, 30.0, 'give it in m/s^2, about 9.8'),
+    'gravity_sd': (0.0, 1.0, 'give it in m/s^2'),
+    'latitude': (-90.0, 90.0, 'give it in degrees'),
+    'height': (-12000.0, 1e5, 'give it in m'),
+    'azimuth_deg': (-720.0, 720.0, 'give it in degrees clockwise from true north'),
+    'joint_noise_rad': (0.0, 0.1, 'give it in rad'),
+    'joint_error_rad': (0.0, 0.1, 'give it in rad'),
+    'joint_error_m': (0.0, 0.1, 'give it in m'),
+}
+
+
+def joint_entries(mapping: Any) -> tuple:
+    """Return the entries of the joints in a table description, none when it has no list of them."""
+    joints = mapping.get('joints') if isinstance(mapping, Mapping) else None
+    return tuple(joints) if isinstance(joints, (list, tuple)) else ()
+
+
+def site_from_mapping(mapping: Any) -> dict[str, Any]:
+    """Return the entries of a table description except the joints, as arguments of `Table`."""
+    require_keys(mapping, [f.name for f in fields(Table) if not f.name.startswith('mount_')] + ['mount'], 'table')
+    values = {name: value for name, value in mapping.items() if value is not None and name not in ('mount', 'joints')}
+    mount = mapping.get('mount') or {}
+    require_keys(mount, _MOUNT_KEYS, 'table mount')
+    return values | {f'mount_{name}': value for name, value in mount.items() if value is not None}
+
+
+def base_heading_deg(mat_nb: np.ndarray) -> float:
+    """Return where the base x axis points in the level frame, degrees counter-clockwise from its x axis; zero when it is vertical."""
+    x, y, _ = mat_nb[:, 0]
+    return float(np.degrees(np.arctan2(y, x))) if np.hypot(x, y) > 1e-9 else 0.0
+
+
+def _require_joints(joints):
+    if not joints:
+        raise InputError('table: joints must list at least one joint, got none; describe them from the base outwards', code='no_joint')
+    names = [joint.name for joint in joints]
+    for name in names:
+        if not isinstance(name, str) or not name or names.count(name) > 1:
+            raise InputError(f'table: joint names must be different and not empty, got {names}; use the names of the joint states',
+                             code='joint_names')
+    followers = {joint.name for joint in joints if joint.mimic is not None}
+    for joint in joints:
+        if joint.source in followers:
+            raise InputError(f"table: joint '{joint.name}' must follow a joint that moves by itself, '{joint.source}' follows another one; "
+                             'name that one')

@@ -1,0 +1,191 @@
+"""A robot description (URDF) becomes the chain that carries the sensor: the joints between the root and the sensor's link."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.core.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
+from imu_calibration.core.documents import LARGEST
+from imu_calibration.core.errors import InputError, printable, shortened
+from imu_calibration.kinematics.joint import LIMIT_KEYS, Joint, JointLimits, Mimic, limits_from_mapping, require_keys, three_numbers
+from imu_calibration.kinematics.reference_motion import rotation_from_rpy, rpy_from_rotation
+from imu_calibration.kinematics.table import Table, joint_entries, site_from_mapping
+
+JOINT_ERRORS = {'joint_error_rad': 1e-3, 'joint_error_m': 1e-3}
+"""Default standard deviations of an arm's joints: arms have 0.1 to 1 mrad and 0.1 to 1 mm."""
+
+_MOVING = {'revolute': 'revolute', 'continuous': 'revolute', 'prismatic': 'prismatic'}
+_READ = {'link': (), 'joint': ('origin', 'parent', 'child', 'axis', 'limit', 'mimic')}
+"""Elements that describe the kinematics, with their children; meshes, materials, controllers and simulators' tags are ignored."""
+
+
+def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None = None) -> Table:
+    """
+    Return the chain of joints from the root of a robot to one of its links.
+
+    Fixed joints are folded into their neighbours; a joint that mimics another one is moved by the readings of that one. The root's
+    z axis points up unless the site differs.
+
+    Parameters
+    ----------
+    text : str or bytes
+        The URDF.
+    link : str
+        Link whose frame is the sensor's: the frame_id of its messages.
+    site : mapping, optional
+        Entries of a table description except the joints (up, gravity, latitude, mount, ...); its joints may give limits, by name.
+        Without gravity and latitude the standard gravity is used, with the standard deviation of an unknown site.
+
+    Raises
+    ------
+    InputError
+        When the text is no robot description, the link is not in it or does not move, a joint on the way has several degrees of
+        freedom, or the site names a joint that is not on the way.
+
+    """
+    robot = _read(text)
+    values = site_from_mapping(site or {})
+    if values.get('gravity') is None and values.get('latitude') is None:
+        values |= {'gravity': STANDARD_GRAVITY, 'gravity_sd': values.get('gravity_sd') or STANDARD_GRAVITY_SD}
+    joints, rest = _chain(robot, link)
+    xyz, rpy_deg = (three_numbers(values.get(f'mount_{name}', (0.0, 0.0, 0.0)), f'mount {name}') for name in ('xyz', 'rpy_deg'))
+    mount = rest.then(np.array(xyz), rotation_from_rpy(np.radians(rpy_deg)))
+    values |= {f'mount_{name}': value for name, value in mount.fields.items()}
+    return Table(**JOINT_ERRORS | values | {'joints': _with_limits(joints, joint_entries(site or {}), link)})
+
+
+def root_of(text: str | bytes) -> str:
+    """Return the name of the root link."""
+    robot = _read(text)
+    roots = [link for link in robot.link_map if link not in robot.parent_map]
+    if len(roots) != 1:
+        raise InputError(f'a robot description must have one root link, it has {_listed(roots) or "none"}; correct it')
+    return roots[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Placement:
+    """A frame in another one: where its origin is, and how it is turned."""
+
+    xyz: np.ndarray
+    matrix: np.ndarray
+
+    def then(self, xyz, matrix):
+        """Return the placement of a frame that is placed in this one."""
+        return _Placement(self.xyz + self.matrix @ xyz, self.matrix @ matrix)
+
+    @property
+    def fields(self):
+        """As fields of a `Joint`."""
+        return {'xyz': tuple(self.xyz.tolist()), 'rpy_deg': tuple(np.degrees(rpy_from_rotation(self.matrix)).tolist())}
+
+
+def _read(text):
+    """Return the parser's robot from the links and joints of the text."""
+    from xml.etree import ElementTree
+
+    try:
+        from urdf_parser_py.urdf import Robot
+    except ImportError as error:
+        raise InputError("a robot description needs the package urdfdom-py, it is not installed; install 'imu_calibration[arm]'",
+                         code='package_missing') from error
+    try:
+        if len(text) > LARGEST:
+            raise ValueError(f'it has {len(text)} characters, at most {LARGEST} are accepted')
+        root = ElementTree.fromstring(text)
+        for element in root.iter():
+            element.attrib.update((key, printable(value)) for key, value in element.items())
+        if root.tag != 'robot':
+            raise ValueError(f'its outermost element is <{root.tag}>')
+        bare = ElementTree.Element('robot', root.attrib)
+        for element in (child for child in root if child.tag in _READ):
+            ElementTree.SubElement(bare, element.tag, element.attrib).extend(child for child in element if child.tag in _READ[element.tag])
+        return Robot.from_xml_string(ElementTree.tostring(bare))
+    except Exception as error:   # the parsers raise many kinds
+        raise InputError(f'a robot description must be a URDF, this is not: {shortened(str(error), 200)}; give the .urdf or .xacro of '
+                         'the robot') from error
+
+
+def _chain(robot, link):
+    """Return the moving joints from the root to `link`, and the placement of the link after the last of them."""
+    if link not in robot.link_map:
+        raise InputError(f"the robot description must hold the link '{link}' that carries the IMU, it holds {_listed(robot.link_map)}; "
+                         'name one of these', key='imu_link', code='link_unknown')
+    on_the_way = []
+    while link in robot.parent_map:
+        name, link = robot.parent_map[link]
+        on_the_way.append(robot.joint_map[name])
+        if len(on_the_way) > len(robot.joint_map):
+            raise InputError(f"the links of a robot description must form a tree, those around '{link}' form a circle; correct it")
+    joints, placement = [], _Placement(np.zeros(3), np.eye(3))
+    for joint in reversed(on_the_way):
+        placement = placement.then(*_origin(joint))
+        if joint.type == 'fixed':
+            continue
+        if joint.type not in _MOVING:
+            raise InputError(f"joints on the way to the IMU must be revolute, continuous, prismatic or fixed, '{joint.name}' is "
+                             f'{joint.type}; use a description that begins after it')
+        joints.append(Joint(joint.name, tuple(joint.axis or (1.0, 0.0, 0.0)), type=_MOVING[joint.type], mimic=_mimic(robot, joint),
+                            limits=_limits(joint), **placement.fields))
+        placement = _Placement(np.zeros(3), np.eye(3))
+    if not joints:
+        raise InputError(f"the link '{on_the_way[0].child if on_the_way else link}' must be moved by at least one joint, it is fixed to "
+                         f"the root '{link}'; name the link that carries the IMU, or calibrate by hand")
+    return joints, placement
+
+
+def _origin(joint):
+    xyz, rpy = (three_numbers((joint.origin and getattr(joint.origin, name)) or (0, 0, 0), f'origin {name} of joint {joint.name}')
+                for name in ('xyz', 'rpy'))
+    return np.array(xyz), rotation_from_rpy(rpy)
+
+
+def _mimic(robot, joint):
+    """Return the joint at the end of the chain of followed joints, or None."""
+    multiplier, offset, name, seen = 1.0, 0.0, joint.name, []
+    while robot.joint_map[name].mimic is not None:
+        mimic = robot.joint_map[name].mimic
+        offset += multiplier * (mimic.offset or 0.0)
+        multiplier *= 1.0 if mimic.multiplier is None else mimic.multiplier
+        seen.append(name)
+        name = mimic.joint
+        if name not in robot.joint_map or name in seen:
+            raise InputError(f"joint '{joint.name}' must mimic another joint of the robot, it mimics '{name}'; correct the description")
+    return None if name == joint.name else Mimic(name, multiplier, offset)
+
+
+def _limits(joint):
+    """Return the limits in the description: a continuous joint is endless, placeholders (zero, infinite) count as not given."""
+    limit, endless = joint.limit, joint.type == 'continuous'
+    ends = (0.0, 0.0) if limit is None else (limit.lower or 0.0, limit.upper or 0.0)
+    ends = (None, None) if endless or ends == (0.0, 0.0) or not all(map(math.isfinite, ends)) else ends
+    speed = limit.velocity if limit is not None and limit.velocity and math.isfinite(limit.velocity) else None
+    return JointLimits(*ends, speed, endless=endless, described=frozenset(('lower', 'upper', 'speed', 'endless')))
+
+
+def _with_limits(joints, entries, link):
+    """Return the joints with the limits that the site gives, by name."""
+    by_name = {joint.name: joint for joint in joints}
+    for entry in entries:
+        name = entry.get('name') if isinstance(entry, Mapping) else None
+        if name not in by_name:
+            raise InputError(f"joints of the site must be on the way to '{link}': {_listed(by_name)}; got {name!r}", code='joint_unknown')
+        known = by_name[name]
+        require_keys(entry, ('name', *LIMIT_KEYS[known.type]), f"limits of joint '{name}'")
+        given = limits_from_mapping(entry, known.type)
+        better = {key: value for key, value in vars(given).items() if key != 'described' and value is not None and value is not False}
+        if given.endless or given.lower is not None:   # a range and endless exclude each other
+            better = {'lower': None, 'upper': None, 'endless': False} | better
+        better['described'] = known.limits.described - set(better)
+        by_name[name] = replace(known, limits=replace(known.limits, **better))
+    return tuple(by_name.values())
+
+
+def _listed(names):
+    names = sorted(names)
+    return ', '.join(names[:12]) + (f' and {len(names) - 12} more' if len(names) > 12 else '')

@@ -1,0 +1,192 @@
+"""``ros2 doctor``: the Imu topics of the running system, their type, quality of service, stamps, units, frames and covariances."""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, qos_check_compatible
+from ros2cli.node.direct import DirectNode
+from ros2doctor.api import DoctorCheck, DoctorReport, Report, Result
+from ros2doctor.api.format import doctor_error, doctor_warn
+from sensor_msgs.msg import Imu
+
+from imu_calibration.nodes.inputs import BatchInput
+from imu_calibration.preprocessing.block_cleaning import BlockCleaner
+from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.message_checks import check_messages
+from imu_calibration.preprocessing.recording_evidence import GOOD, REFUSE, WARNING, CheckFinding
+from msg_adapters.imu_stream import ImuHeads
+from msg_adapters.live import LiveGatherer
+
+TYPE = 'sensor_msgs/msg/Imu'
+SECONDS = 3.0
+"""Seconds of recording, up to `PATIENCE` times as many if fewer than `ENOUGH` messages were received."""
+DISCOVERY = 2.0
+"""Seconds in which the nodes of the system are found, up to `PATIENCE` times where no Imu topic was."""
+PATIENCE = 3
+ENOUGH = 100
+"""Messages that suffice to check a topic."""
+NAMES = ('imu/data', 'imu/data_raw', 'imu/data_corrected')
+"""Endings of topics that carry Imu messages by convention (REP 145)."""
+NOT_MEASURED = ('/imu/residual',)
+"""Endings of topics of that type which are no measurement."""
+
+
+@dataclass(frozen=True)
+class StreamFindings:
+    """Properties of one topic."""
+
+    topic: str
+    """Full name."""
+    source: str
+    """Its publishers and how reliable they are."""
+    findings: tuple[CheckFinding, ...]
+    """Findings of preflight."""
+
+
+def look(node: Node, spin_once: Any) -> list[StreamFindings]:
+    """
+    Record every Imu topic for some seconds and return the findings by name.
+
+    Parameters
+    ----------
+    node : Node
+        Subscribes for that time.
+    spin_once : callable
+        Spins the node once; called with the node and ``timeout_sec=``.
+
+    """
+    for _ in range(PATIENCE):
+        _spin(node, spin_once, DISCOVERY)
+        if topics := _imu_topics(node):
+            break
+    streams = [_Stream(node, name) for name in topics]
+    _spin(node, spin_once, 0.2)
+    for stream in streams:
+        stream.ask_for_what_is_offered()
+    for _ in range(PATIENCE):
+        _spin(node, spin_once, SECONDS)
+        if all(stream.count >= ENOUGH for stream in streams):
+            break
+    return [stream.findings() for stream in streams]
+
+
+def _imu_topics(node):
+    """Return the published topics with Imu messages, or with names of Imu topics."""
+    return [name for name, types in sorted(node.get_topic_names_and_types())
+            if (TYPE in types or name.endswith(NAMES)) and not name.endswith(NOT_MEASURED) and node.count_publishers(name)]
+
+
+def _spin(node, spin_once, seconds):
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        spin_once(node, timeout_sec=left)
+
+
+class _Stream:
+    """One topic that is listened to."""
+
+    def __init__(self, node, topic):
+        self.node, self.topic = node, topic
+        self._begin()
+        self.by_wall_clock = not node.count_publishers('/clock')   # otherwise stamps are in simulated time
+        self.input = BatchInput(node, Imu, topic, add=self._add)
+
+    def _begin(self):
+        self.heads, self.gatherer, self.count = ImuHeads(), LiveGatherer(), 0
+
+    def ask_for_what_is_offered(self):
+        """Subscribe with the QoS of the publishers; start again, because messages queued for the first subscription are received twice."""
+        self.input.look()
+        self._begin()
+
+    def _add(self, data, sent_ns):
+        self.heads.add(data, time.time_ns() if self.by_wall_clock else 0)
+        self.gatherer.add_imu(data, sent_ns)
+        self.count += 1
+
+    def findings(self):
+        """Return the StreamFindings."""
+        self.input.look()
+        preflight = Preflight(strict=False)
+        deque(BlockCleaner(watchers=[preflight]).all_of([self.gatherer.flush()]), maxlen=0)
+        found = (*self._publishers(), *self._listeners(), *check_messages(self.heads.evidence()), *preflight.findings)
+        return StreamFindings(self.topic, self.input.source(), found)
+
+    def _publishers(self):
+        for other in self.input.others:
+            yield CheckFinding('type', REFUSE, f'a topic must have one type, {other.node_name} publishes {other.topic_type} here instead '
+                               f'of {TYPE}; rename its topic')
+        names = sorted(self.input.names())
+        if len(names) > 1:
+            yield CheckFinding('publishers', WARNING, f'one node must publish a topic, {len(names)} do ({", ".join(names)}): their '
+                               'messages mix; stop all but one, or rename their topics')
+        if names and not self.heads.evidence().frame_ids:
+            yield CheckFinding('silence', WARNING, f'messages are required, none came in {PATIENCE * SECONDS:g} s; check the driver')
+
+    def _listeners(self):
+        wrong = 0
+        for listener in self.node.get_subscriptions_info_by_topic(self.topic):
+            for publisher in self.input.publishers:
+                answer, why = qos_check_compatible(publisher.qos_profile, listener.qos_profile)
+                if answer == QoSCompatibility.ERROR:
+                    wrong += 1
+                    yield CheckFinding('qos', REFUSE, f'a subscriber must request at most the offered QoS, {listener.node_name} receives '
+                                       f'nothing from {publisher.node_name}: {why.partition(": ")[2].rstrip(";") or why}')
+        if self.input.publishers and not wrong:
+            reliable = 'reliable' if self.input.reliable else 'best effort: messages lost by the network are not repeated'
+            yield CheckFinding('qos', GOOD, f'published {reliable}')
+
+
+CATEGORY = 'imu'
+
+
+@cache
+def _streams() -> list[StreamFindings]:
+    """Return the findings, computed once for check and report."""
+    with DirectNode(None) as direct:
+        return look(direct.node, rclpy.spin_once)
+
+
+class ImuCheck(DoctorCheck):
+    """Check that Imu messages follow the conventions of sensor_msgs."""
+
+    def category(self) -> str:
+        """Return the name that links the check and its report."""
+        return CATEGORY
+
+    def check(self) -> Result:
+        """Return the faults of each topic."""
+        result = Result()
+        kinds: dict[str, tuple[Callable, Callable]] = {REFUSE: (doctor_error, result.add_error), WARNING: (doctor_warn, result.add_warning)}
+        for stream in _streams():
+            for finding in stream.findings:
+                if finding.severity in kinds:
+                    tell, count = kinds[finding.severity]
+                    tell(f'{stream.topic}: {finding.check.replace("_", " ")}: {finding.text}')
+                    count()
+        return result
+
+
+class ImuReport(DoctorReport):
+    """Report the properties of every Imu topic."""
+
+    def category(self) -> str:
+        """Return the name that links the check and its report."""
+        return CATEGORY
+
+    def report(self) -> Report:
+        """Return a line for each finding."""
+        report = Report('IMU STREAMS')
+        for stream in _streams():
+            report.add_to_report('topic', stream.source)
+            for finding in stream.findings:
+                report.add_to_report(finding.check.replace('_', ' '), f'{finding.severity}: {finding.text}')
+        if not report.items:
+            report.add_to_report('topic', 'none of type sensor_msgs/msg/Imu has a publisher')
+        return report

@@ -1,0 +1,259 @@
+"""The next step of a campaign: a motion, a diagnosis, or the end with its reason."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.settings import setting
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.status import HELD
+from imu_calibration.kinematics.motion_limits import MotionLimits
+from imu_calibration.kinematics.table import Table
+from imu_calibration.planning.planner import Planner
+from imu_calibration.planning.separation import make_separator
+from imu_calibration.references.options import CalibrationOptions
+
+TIME_OVER = 'the time given is over'
+IN_VAIN = 'motions no longer reduce the standard deviations as planned: the limit is not noise'
+PATIENCE = 6
+"""Motions after which the standard deviations must have decreased."""
+LEAST_SHARE = 0.93
+"""Largest share of the logarithms of excess over tolerance that may remain after them; otherwise further motions do not pay."""
+
+
+class MotionPlanner(Protocol):
+    """Interface of a planner (`planning.planner.Planner`)."""
+
+    @property
+    def excess(self) -> dict[str, float]:
+        """Standard deviation over tolerance of each requested parameter."""
+
+    def take(self, calibration: Any) -> None:
+        """Replace the predicted information by the measured information."""
+
+    def next_motion(self, position: np.ndarray) -> Any:
+        """Return the NextMotion from where the joints are, and count on it."""
+
+
+
+@dataclass(frozen=True)
+class CampaignSettings:
+    """When to end."""
+
+    time_limit: float = setting(1800.0, 's', 'time given to all motions together, by the stamps of the joint states', (1.0, 1e6),
+                                'too small: parameters stay outside their tolerance', live=True)
+    separations: int = setting(2, '1', 'largest number of extra motions that separate collinear causes of the diagnosis; 0: none, and '
+                               'no diagnosis at the end', (0, 20), 'too small: a finding remains collinear with other effects', live=True)
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A finding of a diagnosis and the effects that are collinear with it."""
+
+    effect: str
+    """Published name."""
+    mates: tuple[str, ...] = ()
+    """Effects that are collinear with it."""
+    sizes: dict[str, float] = field(default_factory=dict)
+    """Parameter -> value, SI, of the effect and of each mate in its place."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The next step: exactly one of a motion, a diagnosis and the end."""
+
+    motion: Any = None
+    """PlannedMotion to be driven."""
+    diagnose: bool = False
+    """Whether to diagnose."""
+    why: str = ''
+    """One line."""
+
+
+class Campaign:
+    """
+    Goes from motion to motion.
+
+    Parameters
+    ----------
+    planner : MotionPlanner
+    settings : CampaignSettings
+    make_separator : callable, optional
+        Returns a planner of motions that separate a Suspect from its mates, or raises an ImuCalibrationError if none exists.
+    first : callable, optional
+        Returns the first motion from a position, None for none.
+    unwind : callable, optional
+        Returns the motion that turns wound joints back from a position, None if none is needed; driven before the campaign ends.
+
+    """
+
+    def __init__(self, planner: MotionPlanner, settings: CampaignSettings = CampaignSettings(),
+                 make_separator: Callable[[Suspect], MotionPlanner] | None = None, *,
+                 first: Callable[[np.ndarray], Any] = lambda position: None,
+                 unwind: Callable[[np.ndarray], Any] = lambda position: None):
+        self.planner, self.settings, self._make_separator, self._unwind = planner, settings, make_separator, unwind
+        self._first: Callable[[np.ndarray], Any] | None = first
+        self._separator: MotionPlanner | None = None
+        self.findings: list[Suspect] | None = None
+        """Findings of the last diagnosis, the strongest first; None before the first diagnosis."""
+        self.separations = 0
+        self.told_apart: tuple[str, ...] = ()
+        """The collinear class of the last separating motion."""
+        self._is_asked = False
+        self._left: list[float] = []
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The parameter furthest outside its tolerance, and its standard deviation over tolerance."""
+        excess = self.planner.excess
+        return max(excess.items(), key=lambda item: item[1]) if excess else ('', 0.0)
+
+    def take(self, calibration: Any) -> None:
+        """Replace the predicted information by that measured in the motions so far."""
+        self.planner.take(calibration)
+        self._left.append(sum(max(math.log(excess), 0.0) for excess in self.planner.excess.values() if excess > 0))
+
+    def take_findings(self, findings: list[Suspect] | None) -> str:
+        """Store the findings of a diagnosis, None if it failed; return the resulting action as text, '' for none."""
+        self._is_asked = True
+        self.findings = self.findings if findings is None else findings
+        for finding in findings or []:
+            if finding.mates and self.separations < self.settings.separations and self._make_separator is not None:
+                what = f'{finding.effect} is collinear with {", ".join(finding.mates)} in the motion so far'
+                try:
+                    self._separator = self._make_separator(finding)
+                except ImuCalibrationError as error:
+                    return f'{what}, and no motion is known that separates them: {error}'
+                self.separations, self.told_apart = self.separations + 1, (finding.effect, *finding.mates)
+                self._left.clear()
+                return f'{what}: planning the motion that separates them'
+        return ''
+
+    @property
+    def is_separating(self) -> bool:
+        """Whether the present motions separate collinear causes."""
+        return self._separator is not None
+
+    def decide(self, position: np.ndarray, elapsed: float) -> Decision:
+        """
+        Return what to do next.
+
+        Parameters
+        ----------
+        position : ndarray, shape (n_joints,)
+            Where the joints rest.
+        elapsed : float
+            Seconds since the first motion began.
+
+        """
+        first, self._first = self._first, None
+        if first is not None and (motion := first(position)) is not None:
+            return Decision(motion, why='the first motion is small and slow')
+        decision = self._decide(position, elapsed)
+        if decision.motion is None and not decision.diagnose and (motion := self._unwind(position)) is not None:
+            return Decision(motion, why=f'{decision.why}; before the end, endless joints are unwound')
+        return decision
+
+    def _decide(self, position, elapsed):
+        if elapsed >= self.settings.time_limit:
+            return Decision(why=f'{TIME_OVER}{self._outside()}')
+        step = None if self._separator is None else self._separator.next_motion(position)
+        if step is None or step.motion is None:   # predicted only: a calibration has no information on causes that its model lacks
+            has_separated, self._separator = self._separator is not None, None
+            if has_separated:
+                return Decision(diagnose=True, why='the causes should be separable now')
+            if self._promises_in_vain:
+                return self._ending(IN_VAIN)
+            step = self.planner.next_motion(position)
+        if step.motion is not None and elapsed + step.seconds > self.settings.time_limit:
+            return Decision(why=f'{TIME_OVER}: the next motion takes {step.seconds:.0f} s{self._outside()}')
+        if step.motion is not None:
+            self._is_asked = False
+            return Decision(step.motion, why=step.reason)
+        return self._ending(step.reason)
+
+    def _ending(self, reason):
+        if self.settings.separations and not self._is_asked:
+            return Decision(diagnose=True, why=reason)
+        return Decision(why=reason + self._outside() + self._named())
+
+    @property
+    def _promises_in_vain(self):
+        """Whether the last motions gave almost none of the predicted reduction."""
+        return len(self._left) > PATIENCE and self._left[-1] > LEAST_SHARE * self._left[-1 - PATIENCE] > 0
+
+    def _outside(self):
+        missing = [name for name, excess in self.planner.excess.items() if excess > 1.0]
+        if not missing:
+            return ''
+        return f'; outside its tolerance: {", ".join(missing[:3])}' + (f' and {len(missing) - 3} more' if missing[3:] else '')
+
+    def _named(self):
+        if not self.findings:
+            return ''
+        mates = [f' (collinear with {", ".join(each.mates)})' if each.mates else '' for each in self.findings]
+        return '; beyond bias and matrix there is ' + ', '.join(each.effect + text for each, text in zip(self.findings, mates, strict=True))
+
+
+LONGEST = 180.0
+"""Causes that no plan of this length separates count as one cause for this table, s."""
+
+
+def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, noise: dict[str, NoiseModel], rate: float = 100.0,
+                 options: CalibrationOptions = CalibrationOptions(), limits: MotionLimits | None = None) -> Planner:
+    """
+    Return the planner of the motion that separates a suspect from its mates.
+
+    Parameters
+    ----------
+    table : Table
+    calibration : Calibration
+        The calibration, of a model that may lack the suspect.
+    suspect : Suspect
+    noise : mapping
+        Sensor -> NoiseModel of single samples at `rate`.
+    rate : float
+        Samples of the IMU per second.
+    options : CalibrationOptions
+        Tolerances and catalogue.
+    limits : MotionLimits, optional
+        Default: the limits of the table.
+
+    Raises
+    ------
+    InputError
+        When an effect is unknown, or no motion can show it.
+
+    """
+    sensors = {name: sensor for sensor, name in options.catalogue.effects(table.joint_names)}
+    for name in (suspect.effect, *suspect.mates):
+        if name not in sensors:
+            raise InputError(f"a cause must be an effect of the catalogue, got '{name}'; name one that it has", code='cause_unknown')
+    causes = [(sensors[name], name) for name in (suspect.effect, *suspect.mates)]
+    planner = make_separator(table, with_suspect(calibration, causes[0], suspect.sizes), causes, noise=noise, rate=rate, options=options,
+                             sizes=suspect.sizes, limits=limits)
+    planner.within(LONGEST)
+    return planner
+
+
+def with_suspect(calibration: Calibration, cause: tuple[str, str], sizes: dict[str, float]) -> Calibration:
+    """Return the calibration with an effect at its estimated size; the other parameters do not change."""
+    if cause in calibration.model.slices:
+        return calibration
+    model = calibration.model.with_effect(*cause)
+    effect = next(each for each in model.effects if (each.sensor, each.name) == cause)
+    values = model.start_from(calibration.model, calibration.values)
+    values[model.slices[cause]] = [sizes.get(name, 0.0) for name in effect.param_names()]
+    places = [model.param_names.index(name) for name in calibration.param_names]
+    covariance, status = np.diag(model.prior()[1]**2), [HELD] * len(values)
+    covariance[np.ix_(places, places)] = calibration.covariance
+    for place, known in zip(places, calibration.status, strict=True):
+        status[place] = known
+    return replace(calibration, model=model.at(values), values=values, covariance=covariance, status=tuple(status))

@@ -1,0 +1,136 @@
+"""The range of a sensor: largest outputs and how often each was read (a pile at its end), and the full scale of a gyroscope."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imu_calibration.preprocessing.chunks import Chunks
+from imu_calibration.preprocessing.rest import Rest
+
+FAR = 0.25
+"""
+Rms angle by which gravity misses the direction after a turn, rad, above which factors are tested: scale errors of a tenth cause less.
+"""
+BETTER = 0.3
+"""A factor is accepted when the remaining angle is below this share of the angle without it."""
+FACTORS = 2.0 ** np.arange(-4.0, 4.01, 0.25)
+"""
+Tested ratios of readings to true rates: full-scale ranges from a sixteenth to sixteen times the set range, and intermediate values.
+"""
+NEAR_POWER = 0.15
+"""A factor within this share of a power of two is one: scales are off by a few per cent."""
+LEAST_TURNS, MOST_TURNS = 3, 16
+LEAST_ANGLE = 0.3
+"""Least turn of gravity for a test of factors, rad."""
+LONGEST = 30.0
+"""s; the gyroscope's wander adds up in longer turns."""
+
+
+def believed_factor(missed: Callable[[float], float]) -> float:
+    """
+    Return the factor between measured and true rates that carries gravity from before each turn to after it, 1 when they fit as they are.
+
+    Parameters
+    ----------
+    missed : callable
+        Factor -> typical angle by which gravity misses its direction after a turn, rad.
+
+    """
+    as_it_is = missed(1.0)
+    if as_it_is < FAR:
+        return 1.0
+    angles = [missed(factor) for factor in FACTORS]
+    best = int(np.argmin(angles))
+    return nearest_power(FACTORS[best]) if angles[best] < BETTER * as_it_is else 1.0
+
+
+def nearest_power(factor: float) -> float:
+    """Return the power of two that a factor is within `NEAR_POWER` of, else the factor itself."""
+    power = 2.0 ** np.round(np.log2(factor))
+    return float(power if abs(factor / power - 1) < NEAR_POWER else factor)
+
+
+def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
+    """
+    Return the `believed_factor` of a recording in chunks, or None when too few turns lie between rests.
+
+    The mean rates of the chunks are added up from rest to rest; turns within a chunk commute well enough for a factor.
+    """
+    if rest is None or len(rest.ranges) <= LEAST_TURNS:
+        return None
+    centre = rest.sphere[0] if rest.sphere is not None else np.zeros(3)
+    up = (rest.force - centre) / np.linalg.norm(rest.force - centre, axis=1, keepdims=True)
+    whole = np.abs(chunks.duration / np.median(chunks.duration) - 1) < 0.5
+    turns = []
+    for first, ((_, start), (stop, _)) in enumerate(zip(rest.ranges, rest.ranges[1:])):
+        span = chunks.time[stop] - chunks.time[start - 1]
+        unbroken = whole[start:stop].all() and span < 1.5 * np.median(chunks.duration) * (stop - start + 1)
+        if stop > start and unbroken and span < LONGEST and up[first] @ up[first + 1] < np.cos(LEAST_ANGLE):
+            turns.append(((chunks.mean[start:stop, 3:] - rest.rate) * chunks.duration[start:stop, None], up[first], up[first + 1]))
+    if len(turns) < LEAST_TURNS:
+        return None
+    turns = turns[::max(len(turns) // MOST_TURNS, 1)]
+    return believed_factor(lambda factor: float(np.median([_missed(vectors / factor, before, after) for vectors, before, after in turns])))
+
+
+def _missed(vectors, before, after):
+    turned = before
+    for step in Rotation.from_rotvec(-vectors).as_matrix():   # gravity turns the other way in the sensor's axes
+        turned = step @ turned
+    return np.arccos(np.clip(turned @ after, -1.0, 1.0))
+
+
+KEPT = 24
+"""Different outputs below the largest that are counted."""
+NEAR = 0.9
+"""Outputs above this share of the largest are evaluated."""
+CANDIDATES = 400
+LEAST_CLIPPED = 4
+JUMP = 0.01
+"""A step to the largest value by more than this share of it is not noise."""
+PILE = 5.0
+"""A pile has this many times the samples of the outputs just below it."""
+
+
+class Extremes:
+    """The largest distinct values of one signal with their counts, in bounded memory."""
+
+    def __init__(self) -> None:
+        self.level, self.count, self.n_jumps = -np.inf, 0, 0
+        self._below, self._last = {}, np.inf
+
+    def push(self, values: np.ndarray) -> None:
+        """Process values, shape (n,)."""
+        before, self._last = self._last, values[-1]
+        largest = values.max()
+        if largest <= 0 or largest < NEAR * self.level:
+            return
+        if largest > self.level:
+            if np.isfinite(self.level):
+                self._below[self.level] = self.count
+            self.level, self.count, self.n_jumps = float(largest), 0, 0
+        near = values[values > NEAR * self.level]
+        below = near < self.level
+        self.count += len(near) - int(np.count_nonzero(below))
+        near = near[below]
+        if largest == self.level:
+            at = np.flatnonzero(values == largest)
+            self.n_jumps += int(np.count_nonzero(np.where(at > 0, values[at - 1], before) < (1 - JUMP) * largest))
+        if len(near) > CANDIDATES:
+            near = np.partition(near, len(near) - CANDIDATES)[-CANDIDATES:]
+        for value, count in zip(*np.unique(near, return_counts=True)):
+            self._below[float(value)] = self._below.get(float(value), 0) + int(count)
+        self._below = dict(sorted(self._below.items(), reverse=True)[:KEPT])
+
+    @property
+    def jumped(self) -> bool:
+        """Whether the largest value was often reached by a large step, which does not occur with rounded readings of a constant."""
+        return self.n_jumps >= LEAST_CLIPPED
+
+    @property
+    def n_clipped(self) -> int:
+        """Samples at the largest value if their number is far above that of neighbouring values, else 0."""
+        counts = [count for value, count in self._below.items() if value > NEAR * self.level][:10]
+        usual = sum(counts) / len(counts) if counts else 1.0
+        return self.count if self.count >= max(LEAST_CLIPPED, PILE * usual) else 0

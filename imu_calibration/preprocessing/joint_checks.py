@@ -1,0 +1,193 @@
+"""Checks against the table: whether the IMU is on it, units, signs and order of the axes, from windows that calibration gathered anyway."""
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.checks import refuse
+from imu_calibration.preprocessing.exchanges import CLEAR, find_exchange, match_axes
+from imu_calibration.preprocessing.on_table import exchanged, same_motion, signs_or_delay
+from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
+from imu_calibration.preprocessing.standing_still import standing_still
+from imu_calibration.preprocessing.value_checks import force_error
+
+SEEN = {'accelerometer': 0.03, 'gyroscope': 0.01}
+"""Directions in which the reference has less than this share of its largest power are not used."""
+RELATED = 0.5
+"""Smallest squared correlation for a check of factors and axes."""
+LEAST_RATE = 0.02
+"""Least rms of the reference's rates for a check, rad/s."""
+WORDS = {'accelerometer': ('specific force at rest', 'gravity in the attitudes of the joints'),
+         'gyroscope': ('angular rates', 'the rates of the joints')}
+
+
+class Reduced(Protocol):
+    """Reduced data of a recording: `calibration.gathered.Gathered`."""
+
+    @property
+    def accumulator(self) -> Any:
+        """The `estimation.accumulator.Accumulator` of its windows."""
+
+    @property
+    def moving(self) -> list:
+        """Moving windows with kept samples."""
+
+
+def against_joints(gathered: Reduced, model: SensorModel, table: Table | None = None) -> tuple[CheckFinding, ...]:
+    """
+    Return the findings of a comparison of measured rates and forces with those implied by the joints.
+
+    Parameters
+    ----------
+    gathered : Reduced
+        Windows of a recording.
+    model : SensorModel
+        Defines the columns.
+    table : Table, optional
+        With it the mount that would fit is named.
+
+    """
+    found = []
+    for sensor in ('gyroscope', 'accelerometer'):
+        moments = _moments(gathered.accumulator, model, sensor)
+        if moments is not None:
+            found += _rates(moments, gathered.moving, table) if sensor == 'gyroscope' else []
+            found += _axes(sensor, moments, table, gathered.moving)
+    return tuple(found)
+
+
+def _moments(accumulator, model, sensor):
+    """Return sums of products (measured with reference, reference with itself, measured with itself), or None."""
+    part = model.columns_of(sensor, Role.LINEAR)
+    rows = [row for row in accumulator.rows if sensor == 'gyroscope' or row.kind == 'static']
+    if not rows:
+        return None
+    weight = np.array([row.count if sensor == 'gyroscope' else 1.0 for row in rows])
+    means = np.array([row.sensors[sensor].mean for row in rows])
+    if sensor == 'gyroscope':
+        means = means - weight @ means / weight.sum()   # the bias
+    total = (means * weight[:, None]).T @ means
+    for (name, _), factor in accumulator.within.items():
+        if name == sensor == 'gyroscope':
+            total = total + factor.T @ factor
+    if sensor == 'gyroscope':
+        samples = sum(accumulator.samples.values())
+        if np.trace(total[part, part]) < LEAST_RATE**2 * max(samples, 1):
+            return None
+    return total[-3:, part], total[part, part], total[-3:, -3:]
+
+
+def _seen(sensor, moment):
+    """Return (projector on the directions that the reference shows, inverse of its moment there)."""
+    values, vectors = np.linalg.eigh(moment)
+    shown = values > SEEN[sensor] * values.max()
+    vectors = vectors[:, shown]
+    return vectors @ vectors.T, vectors @ np.diag(1.0 / values[shown]) @ vectors.T
+
+
+def _rates(moments, windows, table):
+    found = list(_rate_units(moments))
+    if found:
+        return found
+    finding = None
+    if table is not None:
+        exchange = find_exchange(windows, table)
+        if exchange and not exchange.joints and exchange.span is None:
+            return []   # `_axes` reports turned or exchanged IMU axes, with the mount that fits
+        finding = (exchanged(exchange, windows, table) if exchange else None) or standing_still(windows, table)
+    finding = finding or same_motion(moments, windows, table)
+    return [] if finding is None else [finding]
+
+
+def _rate_units(moments):
+    cross, reference, measured = moments
+    ratio = np.sqrt(np.trace(measured) / np.trace(reference))
+    if not ratio > 0:
+        return
+    if 40 < ratio < 80:
+        yield CheckFinding('rate_unit', REFUSE,
+                           f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: probably deg/s, '
+                           'gyroscope_scale 57.29578; convert them in the driver', key='nominal')
+    elif 1 / 80 < ratio < 1 / 40:
+        yield CheckFinding('rate_unit', REFUSE,
+                           f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: probably '
+                      'degrees; convert them in the driver of the table')
+    elif not 0.5 < ratio < 2.0 and np.linalg.norm(cross)**2 > RELATED * np.trace(measured) * np.trace(reference) / 3:
+        yield CheckFinding('rate_unit', REFUSE,
+                           f'angular rates must be in rad/s, they are {ratio:.4g} times the rates of the joints: counts or volts?; '
+                      'convert them in the driver', key='nominal')
+
+
+def _axes(sensor, moments, table, windows):
+    cross, reference, measured = moments
+    seen, inverse = _seen(sensor, reference)
+    matrix = cross @ inverse
+    if np.trace(matrix @ reference @ matrix.T) < RELATED * np.trace(measured):
+        return   # a different fault dominates the readings and is reported by other checks
+    match = match_axes(matrix, seen)
+    if not match.wrong:
+        return
+    delay = signs_or_delay(windows, table) if sensor == 'gyroscope' and table is not None and match.turned and match.mirrored else None
+    if delay and delay.sure:
+        yield CheckFinding('on_table', REFUSE, f'both streams must share one clock: {delay.words}')
+        return
+    what, whose = WORDS[sensor]
+    yield CheckFinding('handedness', REFUSE,
+                       f'{what} must be {whose}, {_exchange(match, seen)}: {_cause(match, matrix, seen, table)}'
+                       + (f'; or {delay.words}' if delay else ''))
+
+
+def _exchange(match, seen):
+    known = [f"measured {'xyz'[i]} is {'minus ' if sign < 0 else ''}the reference's {'xyz'[j]}" for i, j, sign in match.exchanges(seen)]
+    return ', '.join(known) if known and match.agreement > CLEAR else 'no exchange of axes makes them so'
+
+
+def _cause(match, matrix, seen, table):
+    if match.turned and match.mirrored:
+        return ('this recording does not separate a rotated sensor from a wrong sign; '
+                'correct mount.rpy_deg or the sign of a joint axis in the table, or the signs in the driver')
+    if match.mirrored:
+        return 'left-handed axes, which no mounting explains; correct signs and order in the driver, or the joint axes in the table'
+    fits = ''
+    if table is not None and np.trace(seen) > 2.5:
+        fits = ', [' + ', '.join(f'{angle:.0f}' for angle in _mount_rpy_deg(matrix, table)) + '] would fit'
+    return f'the sensor is turned against the table; correct mount.rpy_deg in the table{fits}'
+
+
+def _mount_rpy_deg(matrix, table):
+    """Return roll, pitch, yaw of the rotation nearest to the measured matrix, in the convention of `mount.rpy_deg`."""
+    left, _, right = np.linalg.svd(matrix)
+    mat_ls = (left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right @ table.mat_sl).T
+    pitch = np.arctan2(-mat_ls[2, 0], np.hypot(mat_ls[2, 1], mat_ls[2, 2]))
+    if np.cos(pitch) < 1e-3:
+        return np.degrees([0.0, pitch, np.arctan2(-mat_ls[0, 1], mat_ls[1, 1])]) + 0.0
+    return np.degrees([np.arctan2(mat_ls[2, 1], mat_ls[2, 2]), pitch, np.arctan2(mat_ls[1, 0], mat_ls[0, 0])]) + 0.0
+
+
+def check_units(gathered: Reduced, model: SensorModel, table: Table | None = None) -> None:
+    """
+    Refuse recordings with units other than SI, or with axes other than those of the table.
+
+    Compares the length of the specific force at rest with gravity, and rates and forces with the values implied by the joints.
+
+    Raises
+    ------
+    InputError
+        With the likely unit, or the assignment of the axes.
+
+    """
+    rows = gathered.accumulator.rows
+    static = [row for row in rows if row.kind == 'static']
+    if static:
+        length = float(np.median([np.linalg.norm(row.sensors['accelerometer'].mean[-3:]) for row in static]))
+        check_force(length)
+    refuse(against_joints(gathered, model, table))
+
+
+def check_force(length: float) -> None:
+    """Refuse a median length of the specific force at rest that is not gravity in m/s^2."""
+    if (error := force_error(length)) is not None:
+        raise error

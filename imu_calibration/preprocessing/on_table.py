@@ -1,0 +1,189 @@
+"""Agreement of the gyroscope's rates with the motion of the joints, and the cause of a disagreement."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.exchanges import LEAST_SAMPLES, SAME, SURE, Exchange
+from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
+from imu_calibration.preprocessing.window import Window
+
+TURNS = 0.05
+"""Smallest gain of the measured rates with respect to the rates of the table for an IMU on the table."""
+LARGEST_SHIFT = 5.0
+"""Largest delay between the streams that is tested, s."""
+LEAST_SHIFT = 0.05
+"""Smaller delays are estimated as a lag, s."""
+ALIKE = 0.02
+"""Shares explained that differ by less do not separate a delay from a wrong sign or from a lag."""
+RESOLVED = 4
+"""Shifts that are tested per sampling period: the rates of fast sweeps differ within one period."""
+
+
+def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> CheckFinding | None:
+    """
+    Return the cause if the gyroscope does not measure the motion of the joints, otherwise None.
+
+    Causes: an IMU that rests while the table turns, a delay between the streams, and a different motion.
+
+    Parameters
+    ----------
+    moments : tuple of three arrays (3, 3)
+        Sums of products of rates: measured with reference, reference with itself, measured with itself.
+    windows : list of Window
+        Stored moving windows with their samples; without them, no delay is found.
+    table : Table, optional
+
+    """
+    cross, reference, measured = moments
+    matrix = cross @ np.linalg.pinv(reference, rcond=0.01)
+    gain = np.sqrt(np.trace(matrix @ reference @ matrix.T) / np.trace(reference))
+    explained = np.trace(matrix @ reference @ matrix.T) / max(np.trace(measured), 1e-300)
+    if explained >= SAME and gain > 0.1 * TURNS:   # other checks report units, signs and axes
+        return _a_period_late(windows, table) if table is not None and explained < 1.0 - ALIKE else None
+    key, cause = 'imu_topic', 'this IMU does not turn when the table does; give the topic of the IMU on the table'
+    if np.trace(measured) > TURNS * np.trace(reference):
+        cause, key = (_cause(windows, table) if table is not None else ''), None
+    elif gain > TURNS:
+        return None
+    if not cause:
+        key, cause = 'imu_topic', ('its motion is not that of the table; give the topic of the IMU on the table, and check '
+                                   'the names of the joints and both clocks')
+    return CheckFinding('on_table', REFUSE, 'the gyroscope must measure the motion of the joints, '
+                        f'they explain {100 * min(explained, 1.0):.0f} % of its rates at a gain of {gain:.2g}: {cause}', key=key)
+
+
+def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckFinding | None:
+    """Return the finding of joints or IMU axes that are exchanged or reversed, or None if a delay explains the rates better."""
+    shift = _best_shift(windows, table)
+    late = abs(shift.seconds) > LEAST_SHIFT and shift.share > exchange.share - ALIKE
+    if late and shift.share > exchange.share + ALIKE:
+        return None
+    phrases = ', '.join(exchange.joints + exchange.axes) + (f' (or {", ".join(exchange.instead)})' if exchange.instead else '')
+    span = '' if exchange.span is None else ' from {:.0f} s to {:.0f} s'.format(*exchange.span)
+    remedy = ('correct names and axes in the table description, or the joint states' if exchange.joints
+              else 'correct the axes in the driver of the IMU') + ('' if exchange.span is None else ', or exclude that time')
+    return CheckFinding('on_table', REFUSE, f'the rates of the gyroscope must agree with the joints{span}, '
+                        f'{100 * exchange.share:.0f} % of them are explained if {phrases}; {remedy}'
+                        + (f'; or {_late(shift.seconds)}' if late else ''))
+
+
+def _cause(windows, table):
+    """Return the delay with which the streams agree, or ''."""
+    shift = _best_shift(windows, table)
+    late = abs(shift.seconds) > LEAST_SHIFT and shift.share > max(SAME, shift.unshifted + ALIKE)
+    return _late(shift.seconds) if late else ''
+
+
+def _a_period_late(windows, table):
+    """Return the finding for streams of a repeating motion that agree clearly better a period earlier or later, or None."""
+    shift, share, unshifted, ambiguous = _best_shift(windows, table)
+    # opposite rates: a wrong sign, or half a period
+    if ambiguous or abs(shift) <= LEAST_SHIFT or unshifted < 0 or share < max(SURE, unshifted + ALIKE):
+        return None
+    return CheckFinding('on_table', REFUSE, 'both streams must share one clock, '
+                        f'the joints explain {100 * unshifted:.0f} % of the rates with a delay up to {LEAST_SHIFT} s '
+                        f'and {100 * share:.0f} % with a larger one: {_late(shift)}')
+
+
+def _late(shift):
+    side = 'behind' if shift > 0 else 'ahead of'
+    return (f'the stamps of the IMU are about {abs(shift):.1f} s {side} those of the joints; '
+            'set both clocks by one source, or stamp in the drivers')
+
+
+class _Shift(NamedTuple):
+    """A delay of the IMU's stamps and the shares of the rates that the joints then explain."""
+
+    seconds: float
+    """Positive: the IMU's stamps are late."""
+    share: float
+    """Share explained with this delay."""
+    unshifted: float
+    """Largest one within +-LEAST_SHIFT, the range of a lag; negative if the rates are opposite."""
+    ambiguous: bool
+    """Whether it is one period of a repeating motion from a peak within the range of a lag, and a delay of the other sign is as good."""
+
+
+@dataclass(frozen=True)
+class Delay:
+    """A delay between the streams that explains opposite rates."""
+
+    words: str
+    """Cause and remedy."""
+    sure: bool
+    """Whether it explains more of the rates than a wrong sign, by more than ALIKE."""
+
+
+def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
+    """
+    Return the delay that explains rates of the opposite sign, or None if a sign explains them better.
+
+    For sweeps to and fro, half a period of delay and a wrong sign differ only by the differences between the sweeps.
+
+    Parameters
+    ----------
+    windows : list of Window
+        Moving windows with their samples.
+    table : Table
+
+    """
+    shift, share, unshifted, _ = _best_shift(windows, table)
+    if abs(shift) <= LEAST_SHIFT or share < SAME or share < -unshifted - ALIKE:
+        return None
+    return Delay(_late(shift), share > -unshifted + ALIKE)
+
+
+def _best_shift(windows, table):
+    """
+    Return the `_Shift` that explains the rates best; of equally good ones, the smallest; without samples, no shift.
+
+    ``share(s) = c |c| / (e_m e_r)`` with c the sum of measured(t) reference(t - s) and e their sums of squares, all of the same pairs.
+    """
+    windows = [window for window in windows if len(window) >= LEAST_SAMPLES]
+    if not windows:
+        return _Shift(0.0, 0.0, 0.0, False)
+    period = float(np.median([window.period for window in windows]))
+    start, end = windows[0].time[0], windows[-1].time[-1]
+    measured, reference = np.zeros((2, int((end - start) / period) + 2, 3))
+    inside = np.zeros((len(measured), 1))
+    bias = np.median(np.concatenate([window.rate_s for window in windows]), axis=0)
+    for window in windows:
+        first = int(np.ceil((window.time[0] - start) / period))
+        grid = start + period * np.arange(first, int((window.time[-1] - start) / period) + 1)
+        part = slice(first, first + len(grid))
+        inside[part] = 1.0
+        for line, rate in ((measured, window.rate_s - bias), (reference, reference_motion(table, window.motion).rate_s)):
+            line[part] = np.stack([np.interp(grid, window.time, column) for column in rate.T], axis=1)
+    measured, reference = (inside * (line - line.sum(axis=0) / inside.sum()) for line in (measured, reference))
+    most = min(int(LARGEST_SHIFT / period), len(measured) // 2)
+    power = [(line**2).sum(axis=1, keepdims=True) for line in (measured, reference)]
+    products, *energies = (_correlations(*pair, most) for pair in ((measured, reference), (power[0], inside), (inside, power[1])))
+    paired = np.logical_and(*(energy > 0.5 * whole.sum() for energy, whole in zip(energies, power)))
+    shares = np.where(paired, products * np.abs(products) / np.maximum(np.prod(energies, axis=0), 1e-300), 0.0)
+    middle, lag = RESOLVED * most, int(RESOLVED * LEAST_SHIFT / period)
+    near = np.abs(shares[middle - lag:middle + lag + 1])
+    place = int(np.argmax(near)) + middle - lag
+    best = _nearest_peak(shares, middle)
+    other = shares[middle + lag + 1:] if best < middle else shares[:max(middle - lag, 0)]
+    twin = 0 < place - middle + lag < 2 * lag and shares[best] < 1.0 - ALIKE and other.max(initial=-1.0) > shares[best] - ALIKE
+    return _Shift((best - middle) * period / RESOLVED, float(shares[best]), float(shares[place]), bool(twin))
+
+
+def _correlations(first, second, most):
+    """Return the sums of first(t) second(t - s) for s up to +-most samples, in steps of 1 / RESOLVED of a sample."""
+    size = 1 << int(np.ceil(np.log2(2 * len(first))))
+    sums = np.fft.irfft((np.fft.rfft(first, size, axis=0) * np.conj(np.fft.rfft(second, size, axis=0))).sum(axis=1), size)
+    shifts = np.arange(-most, most + 1)
+    from scipy.interpolate import CubicSpline  # here, because its import is slow
+    return CubicSpline(shifts, sums[shifts])(np.arange(-most * RESOLVED, most * RESOLVED + 1) / RESOLVED)
+
+
+def _nearest_peak(shares, middle):
+    """Return the index of the peak nearest to zero delay among peaks within ALIKE of the highest: periodic motion has many."""
+    inner = shares[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= shares[:-2]) & (inner >= shares[2:]) & (inner >= shares.max() - ALIKE))
+    return int(peaks[np.argmin(np.abs(peaks - middle))]) if len(peaks) else int(np.argmax(shares))

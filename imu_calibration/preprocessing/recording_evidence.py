@@ -1,0 +1,226 @@
+"""Input of the checks, gathered in one pass over the blocks in bounded memory; and their results."""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.core.samples import smallest_step
+from imu_calibration.preprocessing.block_cleaning import STREAMS, CleanedBlock
+from imu_calibration.preprocessing.chunks import Chunks, ChunkSeries
+from imu_calibration.preprocessing.frozen_parts import FrozenPart, StandingJoints, frozen_chunks, frozen_joints, frozen_parts
+from imu_calibration.preprocessing.full_scale import Extremes, factor_between_rests
+from imu_calibration.preprocessing.rest import Rest, find_rest
+from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
+from imu_calibration.preprocessing.turning import Turning, relate_turns
+
+IRREGULAR = 0.1
+"""Steps farther than this share from the usual one count as irregular."""
+RESOLUTION_SAMPLES = 20_000
+"""First samples, from which the smallest step between readings is estimated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """One stream of stamps."""
+
+    statistics: StreamStatistics
+    """Rates, gaps, drops."""
+    first_ns: int
+    """Smallest stamp."""
+    last_ns: int
+    """Largest stamp."""
+    irregular: float
+    """Share of the steps that are off the usual one by more than a tenth."""
+
+    @property
+    def real_rate(self) -> float:
+        """Samples per second, gaps excluded; 0 when unknown."""
+        s = self.statistics
+        time = s.duration - s.gap_total + s.n_gaps * s.period
+        return (s.count - 1) / time if s.count > 1 and time > 0 else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingEvidence:
+    """A recording as the checks see it, cleaned and in SI."""
+
+    streams: dict
+    """'imu', 'joints', 'temperature' -> Stream; only streams with messages."""
+    chunks: Chunks
+    """Readings of the IMU in short chunks."""
+    n_samples: int
+    """IMU samples that were checked."""
+    n_changed: np.ndarray
+    """How often each of force x, y, z, rate x, y, z differs from the sample before, shape (6,)."""
+    n_repeated: int
+    """Samples with all readings equal to those of the previous sample."""
+    resolution: np.ndarray
+    """Smallest step between readings of each column, shape (6,); 0 when unknown."""
+    ends: tuple
+    """Extremes of each column, (upwards, downwards) six times."""
+    temperature_c: tuple | None
+    """Lowest and highest temperature."""
+    gravity: float
+    """Local gravity, m/s^2."""
+    still_joints_ns: np.ndarray
+    """First and last stamp of each stretch in which no joint position changes, shape (n, 2)."""
+
+    @cached_property
+    def frozen(self) -> dict[str, np.ndarray]:
+        """Sensor -> in which chunks it gives one reading again and again, bool, shape (n,)."""
+        return frozen_chunks(self.chunks, self.resolution)
+
+    @cached_property
+    def awake(self) -> Chunks:
+        """The chunks in which no sensor is frozen."""
+        return self.chunks.select(~np.logical_or(*self.frozen.values()))
+
+    @cached_property
+    def frozen_parts(self) -> list[FrozenPart]:
+        """Where a sensor is frozen, or the joints are while the IMU turns."""
+        rate = np.zeros(3) if self.rest is None else self.rest.rate
+        return frozen_parts(self.chunks, self.frozen) + frozen_joints(self.awake, self.still_joints_ns, rate)
+
+    @cached_property
+    def rest(self) -> Rest | None:
+        """Readings while steady, or None."""
+        return find_rest(self.awake)
+
+    @cached_property
+    def turning(self) -> Turning | None:
+        """How gravity turns against the rates, or None."""
+        return relate_turns(self.awake)
+
+    @cached_property
+    def rate_factor(self) -> float | None:
+        """Ratio of measured rates to the rates that turn gravity from rest to rest, or None."""
+        return factor_between_rests(self.awake, self.rest)
+
+    @cached_property
+    def quiet_range(self) -> np.ndarray:
+        """Largest minus smallest reading in a quiet chunk, shape (6,)."""
+        if self.rest is not None:
+            return self.rest.range
+        return np.quantile(self.awake.range, 0.1, axis=0) if len(self.awake) else np.zeros(6)
+
+    @cached_property
+    def length(self) -> Any:
+        """Gravity as the accelerometer reads it, or None without samples."""
+        if self.rest is not None:
+            return self.rest.length
+        return float(np.median(np.linalg.norm(self.chunks.mean[:, :3], axis=1))) if len(self.chunks) else None
+
+
+class EvidenceGatherer:
+    """Computes the `RecordingEvidence` from cleaned blocks."""
+
+    def __init__(self, gravity: float):
+        self.gravity = gravity
+        self._steps = {name: _Steps() for name in STREAMS}
+        self._chunks, self._ends = ChunkSeries(), tuple((Extremes(), Extremes()) for _ in range(6))
+        self._resolution, self._joints = np.full(6, np.inf), StandingJoints()
+        self._temperature_c: tuple[float, float] | None = None
+
+    def push(self, cleaned: CleanedBlock) -> None:
+        """Process a CleanedBlock."""
+        for name in STREAMS:
+            for epoch, samples in getattr(cleaned, name):
+                self._steps[name].push(samples.stamp_ns, epoch)
+        for _, imu in cleaned.imu:
+            self._take_imu(imu)
+        for _, joints in cleaned.joints:
+            self._joints.push(joints.stamp_ns, joints.position)
+        for _, temperature in cleaned.temperature:
+            low, high = self._temperature_c or (np.inf, -np.inf)
+            self._temperature_c = (min(low, float(temperature.temperature_c.min())), max(high, float(temperature.temperature_c.max())))
+
+    def evidence(self, statistics: dict[str, StreamStatistics]) -> RecordingEvidence:
+        """Return the RecordingEvidence, with the StreamStatistics of each stream."""
+        streams = {name: Stream(statistics[name], *steps.summary()) for name, steps in self._steps.items() if steps.first_ns is not None}
+        resolution = np.where(np.isfinite(self._resolution), self._resolution, 0.0)
+        chunks, series = self._chunks.chunks(), self._chunks
+        return RecordingEvidence(streams, chunks, series.n_samples, series.n_changed, series.n_repeated, resolution, self._ends,
+                                 self._temperature_c, self.gravity, self._joints.stretches())
+
+    def _take_imu(self, imu):
+        columns = np.concatenate([imu.force_s.T, imu.rate_s.T])
+        if self._chunks.n_samples < RESOLUTION_SAMPLES:
+            self._note_resolution(columns[:, :RESOLUTION_SAMPLES])
+        self._chunks.push(imu.stamp_ns, columns)
+        for column, (upwards, downwards) in zip(columns, self._ends):
+            upwards.push(column)
+            downwards.push(-column)
+
+    def _note_resolution(self, columns):
+        self._resolution = np.minimum(self._resolution, smallest_step(columns.T))
+
+
+class _Steps:
+    """First and last stamp, and the share of irregular steps."""
+
+    def __init__(self):
+        self.first_ns = self.last_ns = self._period_ns = self._previous_ns = None
+        self._epoch, self._n_steps, self._n_irregular = 0, 0, 0
+
+    def push(self, stamp_ns, epoch):
+        """Process accepted stamps of one epoch."""
+        if self.first_ns is None:
+            self.first_ns, self.last_ns = int(stamp_ns[0]), int(stamp_ns[0])
+        self.first_ns, self.last_ns = min(self.first_ns, int(stamp_ns[0])), max(self.last_ns, int(stamp_ns[-1]))
+        step = np.diff(stamp_ns)
+        if self._previous_ns is not None and epoch == self._epoch:
+            step = np.append(stamp_ns[0] - self._previous_ns, step)
+        self._previous_ns, self._epoch = stamp_ns[-1], epoch
+        if not len(step):
+            return
+        if self._period_ns is None:
+            self._period_ns = float(np.median(step[:2000]))
+        self._n_steps += len(step)
+        self._n_irregular += int(np.count_nonzero(np.abs(step - self._period_ns) > IRREGULAR * self._period_ns))
+
+    def summary(self):
+        """Return (first stamp, last stamp, share of irregular steps)."""
+        return self.first_ns, self.last_ns, self._n_irregular / max(self._n_steps, 1)
+
+
+class Severity(StrEnum):
+    """How much a finding matters, the worst first."""
+
+    REFUSE = 'refuse'
+    """The result would be wrong."""
+    WARNING = 'warning'
+    """It may suffer."""
+    NOTE = 'note'
+    """Worth knowing."""
+    GOOD = 'good'
+    """Checked and in order."""
+
+
+REFUSE, WARNING, NOTE, GOOD = Severity
+
+
+@dataclass(frozen=True)
+class CheckFinding:
+    """One line about a recording."""
+
+    check: str
+    """Name of the check."""
+    severity: Severity
+    """How much it matters."""
+    text: str
+    """Requirement, received value and remedy; for GOOD, the observation."""
+    samples: int = 0
+    """Samples that are unusable because of it and that no other count holds."""
+    key: str | None = None
+    """The missing input, a key of `errors.KEYS`."""
+
+    def named(self, name: str) -> 'CheckFinding':
+        """Return the finding with the name of its recording before the text."""
+        return replace(self, text=f'{name}: {self.text}')
+
+    def to_mapping(self) -> dict:
+        """Return the entry for the calibration file."""
+        return {'check': self.check, 'severity': self.severity, 'text': self.text, 'samples': self.samples}

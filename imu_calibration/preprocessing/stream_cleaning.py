@@ -1,0 +1,258 @@
+"""One stream of stamped samples, cleaned: unusable samples are dropped and counted, and the stamps are described."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.preprocessing.sample_times import SampleTimes
+from imu_calibration.preprocessing.spike_filter import SpikeFilter
+from imu_calibration.preprocessing.stamping import StampLine
+
+_SECOND = 1_000_000_000
+BACKWARD_RESET_NS = _SECOND
+"""A larger backward step is a reset of the clock, a smaller one a late sample."""
+FORWARD_RESET_NS = 3600 * _SECOND
+"""A larger forward step is a reset of the clock as well (a computer that receives the date after start-up)."""
+_NEEDED = {ImuSamples: ('force_s', 'rate_s'), JointSamples: ('position',), TemperatureSamples: ('temperature_c',)}
+
+
+class StreamCheck:
+    """
+    Cleans one stream; the result does not depend on its division into pieces.
+
+    Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps is kept), 'backward stamp' (a late
+    sample), 'stray stamp' (one sample far from both neighbours), of an IMU also 'spike' (`spike_filter`). 'clock reset' counts the jumps,
+    each of which starts a new epoch.
+    Where the stamps of an IMU follow a clock only loosely (packets, times of arrival, milliseconds, jitter), the times of its samples
+    are computed first (see `sample_times`).
+    """
+
+    def __init__(self) -> None:
+        self.counts = {}
+        self.epoch = 0
+        self._steps = StepHistogram()
+        self._n_accepted = 0
+        self._span_ns = 0
+        self._newest = None
+        self._before_held = None
+        self._held = None
+        self._newest_raw = None
+        self._times = None
+        self._spikes, self._filtered_epoch = SpikeFilter(), 0
+
+    @property
+    def line(self) -> StampLine | None:
+        """Regularity of the IMU stamps (`stamping.StampLine`); None for other streams, and until enough stamps have been received."""
+        return None if self._times is None else self._times.line
+
+    def push(self, samples: Any) -> list[tuple[int, Any]]:
+        """Return a list of (epoch, samples) that are accepted; a few are buffered until their times are determined."""
+        if samples is None or not len(samples):
+            return []
+        return self._without_spikes(self._accept(self._without_strays(self._finite(samples))))
+
+    def finish(self) -> list[tuple[int, Any]]:
+        """Return the buffered samples, as `push` does."""
+        held, self._held = self._held, None
+        return self._without_spikes(([] if held is None else self._accept(held)) + self._end_epoch(), ended=True)
+
+    def statistics(self, gap: float = 0.1) -> 'StreamStatistics':
+        """
+        Return the `StreamStatistics` of the accepted samples.
+
+        Parameters
+        ----------
+        gap : float
+            Steps longer than this, and than five median periods, are counted as gaps, s.
+
+        """
+        period = self._steps.median()
+        return StreamStatistics(self._n_accepted, dict(self.counts), self._span_ns / 1e9, period, self._steps.common_step_ns,
+                                *self._steps.longer_than(max(gap, 5 * period)),
+                                None if self._times is None else self._times.odd_line(self._n_accepted))
+
+    def _without_spikes(self, accepted, ended=False):
+        """Pass the samples of an IMU through the filter; each epoch of the clock is one stream."""
+        passed = []
+        for epoch, samples in accepted:
+            if not isinstance(samples, ImuSamples):
+                passed.append((epoch, samples))
+                continue
+            if epoch != self._filtered_epoch:
+                passed += self._let_out()
+                self._filtered_epoch = epoch
+            passed += [(epoch, part) for part in self._spikes.push(samples)]
+        passed += self._let_out() if ended else []
+        if self._spikes.dropped:
+            self.counts['spike'] = self._spikes.dropped
+        return passed
+
+    def _let_out(self):
+        return [(self._filtered_epoch, part) for part in self._spikes.finish()]
+
+    def _count(self, reason, number):
+        if number:
+            self.counts[reason] = self.counts.get(reason, 0) + int(number)
+
+    def _finite(self, samples):
+        columns = [getattr(samples, name).reshape(len(samples), -1) for name in _NEEDED[type(samples)]]
+        if all(np.isfinite(column).all() for column in columns):
+            return samples
+        finite = np.logical_and.reduce([np.isfinite(column).all(axis=1) for column in columns])
+        self._count('not finite', len(finite) - np.count_nonzero(finite))
+        return samples.select(finite)
+
+    def _without_strays(self, samples):
+        if self._held is not None:
+            samples, self._held = type(samples).concatenate([self._held, samples]), None
+        if not len(samples):
+            return samples
+        started = self._before_held is not None
+        stamps = np.concatenate([[self._before_held], samples.stamp_ns]) if started else samples.stamp_ns
+        step = np.diff(stamps)
+        far = np.abs(step) > BACKWARD_RESET_NS
+        stray = np.zeros(len(stamps), bool)
+        stray[1:-1] = far[:-1] & far[1:] & (np.abs(step[:-1] + step[1:]) < np.minimum(np.abs(step[:-1]), np.abs(step[1:])))
+        if not started and len(step):
+            stray[0] = _is_reset(step[0])
+        stray = stray[started:]
+        undecided = far[-1] if len(step) else True
+        if undecided:
+            self._held = samples.select(slice(len(samples) - 1, None))
+            samples, stray = samples.select(slice(0, len(samples) - 1)), stray[:-1]
+        if len(samples):
+            self._before_held = samples.stamp_ns[-1]
+        self._count('stray stamp', np.count_nonzero(stray))
+        return samples.select(~stray) if stray.any() else samples
+
+    def _accept(self, samples):
+        if self._times is None and isinstance(samples, ImuSamples):
+            self._times = SampleTimes()
+        accepted = []
+        while len(samples):
+            stamps = samples.stamp_ns
+            newest = stamps[0] - 1 if self._newest_raw is None else self._newest_raw
+            before = np.maximum.accumulate(np.concatenate([[newest], stamps]))[:-1]
+            reset = _is_reset(stamps - before)
+            end = int(np.argmax(reset)) if reset.any() else len(stamps)
+            if end:
+                self._newest_raw = max(before[end - 1], stamps[end - 1])
+                accepted += self._in_order(self._timed(samples.select(slice(0, end))))
+            if end < len(stamps):
+                accepted += self._end_epoch()
+                self._count('clock reset', 1)
+                self.epoch, self._newest, self._newest_raw = self.epoch + 1, None, None
+            samples = samples.select(slice(end, None))
+        return accepted
+
+    def _timed(self, samples):
+        if self._times is None:
+            return samples
+        repeated = self._times.n_repeated
+        samples = self._times.push(samples)
+        self._count('repeated stamp', self._times.n_repeated - repeated)
+        return samples
+
+    def _end_epoch(self):
+        return [] if self._times is None else self._in_order(self._times.finish())
+
+    def _in_order(self, samples):
+        """Return [(epoch, samples)] without repeated and backward stamps, [] for none."""
+        if samples is None or not len(samples):
+            return []
+        stamps = samples.stamp_ns
+        newest = stamps[0] - 1 if self._newest is None else self._newest
+        before = np.maximum.accumulate(np.concatenate([[newest], stamps]))[:-1]
+        self._count('repeated stamp', np.count_nonzero(stamps == before))
+        self._count('backward stamp', np.count_nonzero(stamps < before))
+        keep = stamps > before
+        samples = samples if keep.all() else samples.select(keep)
+        if len(samples):
+            joined = samples.stamp_ns if self._newest is None else np.concatenate([[self._newest], samples.stamp_ns])
+            self._steps.add(np.diff(joined))
+            self._span_ns += int(joined[-1] - joined[0])
+            self._newest = joined[-1]
+            self._n_accepted += len(samples)
+        return [(self.epoch, samples)]
+
+
+def _is_reset(step):
+    return (step < -BACKWARD_RESET_NS) | (step > FORWARD_RESET_NS)
+
+
+@dataclass(frozen=True, eq=False)
+class StreamStatistics:
+    """Statistics of the stamps of one stream."""
+
+    count: int
+    """Samples accepted."""
+    dropped: dict
+    """Reason -> number of samples dropped ('clock reset': number of jumps, which drop nothing)."""
+    duration: float
+    """From the first to the last accepted sample, epochs added, s."""
+    period: float
+    """Median step between stamps, s; 0 with fewer than two samples."""
+    stamp_step_ns: int
+    """Greatest common divisor of the steps between stamps, ns (1000000: milliseconds); 0 when unknown."""
+    n_gaps: int
+    """Number of gaps."""
+    gap_total: float
+    """Their total length, s."""
+    longest_step: float
+    """Longest step between stamps, a gap or not, s."""
+    stamping: StampLine | None = None
+    """Regularity of the stamps of an IMU; None if they are regular, and for other streams."""
+    unstamped: int = 0
+    """Samples with stamp zero, for which the time of arrival was used."""
+
+    @property
+    def rate(self) -> float:
+        """Samples per second between gaps, 0 when unknown."""
+        return 1.0 / self.period if self.period > 0 else 0.0
+
+
+_BINS_PER_E = 100
+
+
+_N_BINS = 4500
+"""One per cent wide, up to the longest step that 64 bits of nanoseconds hold."""
+
+
+_FINE_STEP_NS = 100
+
+
+class StepHistogram:
+    """Numbers and sums of steps in bins of equal ratio; adding pieces in any order gives the same numbers."""
+
+    def __init__(self) -> None:
+        self.common_step_ns = 0
+        self._number = np.zeros(_N_BINS, np.int64)
+        self._sum_ns = np.zeros(_N_BINS, np.int64)
+        self._longest_ns = 0
+
+    def add(self, step_ns: np.ndarray) -> None:
+        """Add steps, int64, ns, all positive."""
+        if not len(step_ns):
+            return
+        index = (np.log(step_ns) * _BINS_PER_E).astype(np.int64)
+        np.add.at(self._number, index, 1)
+        np.add.at(self._sum_ns, index, step_ns)
+        self._longest_ns = max(self._longest_ns, int(step_ns.max()))
+        if self.common_step_ns == 0 or self.common_step_ns > _FINE_STEP_NS:
+            self.common_step_ns = int(np.gcd(self.common_step_ns, np.gcd.reduce(step_ns)))
+
+    def median(self) -> float:
+        """Return the median step to one per cent (exact when the steps are equal), s; 0 without steps."""
+        total = self._number.sum()
+        if total == 0:
+            return 0.0
+        middle = np.searchsorted(np.cumsum(self._number), (total + 1) // 2)
+        return float(self._sum_ns[middle] / self._number[middle] / 1e9)
+
+    def longer_than(self, gap: float) -> tuple[int, float, float]:
+        """Return number and total (s) of the steps longer than `gap` s, bin by bin, and the longest step (s)."""
+        filled = np.maximum(self._number, 1)
+        longer = self._sum_ns / filled > gap * 1e9
+        return int(self._number[longer].sum()), float(self._sum_ns[longer].sum() / 1e9), self._longest_ns / 1e9

@@ -1,0 +1,158 @@
+"""State of the streams of a live session from header stamps: rates, silence, dropped samples."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.preprocessing.block_cleaning import MESSAGES
+from imu_calibration.preprocessing.stamping import IRREGULAR, StampLine
+from imu_calibration.preprocessing.window_cutter import dropped
+
+SILENT_AFTER = 2.0
+"""Seconds without a message after which a stream counts as silent; also the lead of one stream's stamps over the other's."""
+RECENT = 10.0
+"""Seconds for which a loss is called recent."""
+COLD_AFTER = 10.0
+"""The same for temperatures, of which one per second is usual."""
+
+
+class StreamHealth(StrEnum):
+    """How the streams of a session are."""
+
+    GOOD = 'good'
+    TROUBLE = 'trouble'
+    """Messages are lost or late, or stamps differ between streams."""
+    SILENT = 'silent'
+    """No messages arrive."""
+
+
+GOOD, TROUBLE, SILENT = StreamHealth
+
+
+@dataclass(frozen=True)
+class StreamState:
+    """The state of all streams together."""
+
+    word: StreamHealth
+    """How they are."""
+    message: str
+    """One line: the fault and the remedy."""
+    values: dict
+    """Figures by name."""
+    silent: tuple = ()
+    """Needed streams without messages: 'imu', 'joints', 'temperature'."""
+    coming: tuple = ()
+    """Streams with messages."""
+    unusable: dict = field(default_factory=dict)
+    """Why the messages of a silent stream are unusable: stream -> dropped samples."""
+    stamping: StampLine | None = None
+    """How the stamps of the IMU are; None while that is not known."""
+
+
+class StreamWatch:
+    """
+    Records every block and reports the state of the streams.
+
+    Parameters
+    ----------
+    joints, temperature : bool
+        Whether joint states and temperatures are needed.
+
+    """
+
+    def __init__(self, joints: bool = True, temperature: bool = False):
+        wanted = {'imu': True, 'joints': joints, 'temperature': temperature}
+        after = {'imu': SILENT_AFTER, 'joints': SILENT_AFTER, 'temperature': COLD_AFTER}
+        self._needed = {name: after[name] for name, asked in wanted.items() if asked}
+        self._count = {'imu': 0, 'joints': 0, 'temperature': 0}
+        self._newest = {}
+        self._arrived = {}
+        self._period = {}
+        self._lost, self._recent = {}, {}
+        self._lost_at: float | None = None
+        self._apart_since: float | None = None
+        self._stamping: Any = None
+        self._unstamped_at: float | None = None
+        self._notes: dict[str, int] = {}
+
+    @property
+    def last_arrival(self) -> float | None:
+        """Arrival time of the last message, s of the clock given to `note`; None before the first."""
+        return max(self._arrived.values(), default=None)
+
+    @property
+    def n_imu(self) -> int:
+        """Number of IMU samples."""
+        return self._count['imu']
+
+    def note(self, block: SampleBlock, now: float) -> None:
+        """Process a SampleBlock that arrived at `now`, s of a steady clock."""
+        for reason, count in (block.notes or {}).items():
+            self._notes[reason], self._unstamped_at = self._notes.get(reason, 0) + count, now
+        for name in self._count:
+            samples = getattr(block, name)
+            if samples is None or not len(samples):
+                continue
+            first, last = int(samples.stamp_ns[0]), int(samples.stamp_ns[-1])
+            if len(samples) > 1 and last > first:
+                self._period[name] = (last - first) * 1e-9 / (len(samples) - 1)
+            self._count[name] += len(samples)
+            self._newest[name], self._arrived[name] = last, now
+
+    def note_counts(self, counts: dict[str, int], now: float) -> None:
+        """Record the counts of samples by their use."""
+        lost = dropped(counts)
+        grown = {reason: count - self._lost.get(reason, 0) for reason, count in lost.items() if count > self._lost.get(reason, 0)}
+        if grown:
+            self._recent, self._lost_at = grown, now
+        self._lost = lost
+
+    def note_stamping(self, line: StampLine | None) -> None:
+        """Record the state of the IMU stamps (a StampLine), or None."""
+        self._stamping = line
+
+    def _apart_for(self, lead, now):
+        """Return the time for which the stamps of the streams have differed, s; in a fast replay they differ briefly."""
+        if abs(lead) <= SILENT_AFTER:
+            self._apart_since = None
+            return 0.0
+        self._apart_since = now if self._apart_since is None else self._apart_since
+        return now - self._apart_since
+
+    def state(self, now: float) -> StreamState:
+        """Return the StreamState at `now`."""
+        values: dict[str, Any] = {f'{name} messages': count for name, count in self._count.items()}
+        values |= {f'{name} rate [Hz]': f'{1 / period:.1f}' for name, period in self._period.items()}
+        values |= {f'dropped: {reason}': count for reason, count in self._lost.items()}
+        values |= self._notes | ({'imu stamps': str(self._stamping)} if self._stamping else {})
+        silent = tuple(name for name, patience in self._needed.items() if now - self._arrived.get(name, float('-inf')) > patience)
+        coming = tuple(name for name in self._arrived if now - self._arrived[name] <= self._needed.get(name, SILENT_AFTER))
+        unusable = {name: self._recently(now, MESSAGES[name]) for name in silent}
+        word, text = self._word(silent, now)
+        return StreamState(word, text, values, silent, coming, {name: what for name, what in unusable.items() if what}, self._stamping)
+
+    def _recently(self, now, beginning=''):
+        """Return the recently dropped samples for reasons with that beginning; '' if none."""
+        if self._lost_at is None or now - self._lost_at >= RECENT:
+            return ''
+        return ', '.join(f'{count} {reason}' for reason, count in self._recent.items() if reason.startswith(beginning))
+
+    def _word(self, silent, now):
+        """Return the state of the streams and the line that describes it."""
+        if silent:
+            none = len(silent) == len(self._needed)
+            return SILENT if none else TROUBLE, f'no {" and no ".join(MESSAGES[name] for name in silent)} messages received' + (
+                '' if none else ', no data can be used until then')
+        lead = (self._newest['imu'] - self._newest['joints']) * 1e-9 if 'joints' in self._needed else 0.0
+        if self._apart_for(lead, now) > SILENT_AFTER:
+            return TROUBLE, (f'the Imu stamps are {abs(lead):.1f} s {"ahead of" if lead > 0 else "behind"} the joint stamps; '
+                             'bring the clocks together')
+        if self._stamping is not None and self._stamping.word == IRREGULAR:
+            return TROUBLE, f"{self._stamping}: sampling times are unknown; the driver should stamp by the sensor's clock"
+        if self._unstamped_at is not None and now - self._unstamped_at < RECENT:
+            notes = ', '.join(f'{count} {reason}' for reason, count in self._notes.items())
+            return TROUBLE, f'{notes}: the driver sets none, the time of arrival is used'
+        if recently := self._recently(now):
+            return TROUBLE, f'dropped lately: {recently}'
+        return GOOD, f'{" and ".join(MESSAGES[name] for name in self._needed)} messages come'

@@ -1,0 +1,260 @@
+"""Checks of the readings: units, axes, clipping outputs, biases, gravity, resolution, temperature."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.units import OTHER_UNITS, significant, unit_of_rest
+from imu_calibration.preprocessing.exchanges import CLEAR, match_axes
+from imu_calibration.preprocessing.frozen_parts import SENSOR_COLUMNS
+from imu_calibration.preprocessing.full_scale import FACTORS, nearest_power
+from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING, CheckFinding, RecordingEvidence
+
+CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
+GRAVITY_SHARE = 0.02
+LINEAR = 0.8
+"""m/s^2; a shorter specific force at rest is noise and bias of an acceleration without gravity. Readings in g have at least 0.8."""
+FASTEST = 100.0
+"""rad/s, 5700 deg/s: above the range of nearly all gyroscopes."""
+FASTEST_DEG = 5000.0
+"""Numbers above it are no deg/s either."""
+CLIP_FORCE = 1.15
+"""Times gravity; outputs without visible noise pile up at gravity without being clipped."""
+FINE = 8.0
+"""Noise that spans this many steps of the converter is visible."""
+CLIP_RATE = 10.0
+"""Times the range of the noise."""
+LEAST_RANGE = 0.4
+"""rad/s, 23 deg/s: a largest rate below it is not the end of the range of a gyroscope."""
+MOST_BIAS = {'accelerometer': 0.25 * STANDARD_GRAVITY, 'gyroscope': 60 * DEG}
+"""m/s^2, rad/s: several times the specification of the cheapest grades (0.1 g, 20 deg/s)."""
+PLACE = 0.005
+"""Share by which gravity differs between places: 9.78 to 9.83 m/s^2."""
+REPEATED_SHARE = 0.05
+ROUNDING = 1e-6
+"""m/s^2, rad/s; no converter is that fine."""
+
+
+def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """Specific force is in m/s^2."""
+    length = evidence.length
+    if length is None:
+        return
+    if (error := force_error(length, 'at rest' if evidence.rest is not None else 'in the middle')) is not None:
+        yield CheckFinding('force_unit', REFUSE, str(error), key=error.key or '')
+    else:
+        yield CheckFinding('force_unit', GOOD, f'specific force in m/s^2: its length is {length:.3f}')
+
+
+def force_error(length: float, where: str = 'at rest') -> InputError | None:
+    """Return the error for a median length of the specific force that is not gravity in m/s^2, None for one that can be."""
+    said = f'specific force must be in m/s^2, its length {where} is {length:.4g}: '
+    if unit := unit_of_rest(length):
+        return InputError(f'{said}it is probably {unit}, accelerometer_scale {OTHER_UNITS[unit]:.6g}; convert it in the driver',
+                          key='nominal', code='force_unit')
+    if length < LINEAR:
+        return InputError(f'{said}it is probably acceleration without gravity, as phones compute it; record the raw accelerometer',
+                          key='imu_topic', code='without_gravity')
+    if not 3.0 < length < 30.0:
+        return InputError(f'{said}counts or volts?; convert it in the driver', key='nominal', code='force_unit')
+    return None
+
+
+def _unit(check, text):
+    """Return the refusal of a unit that a nominal scaling would put right."""
+    return CheckFinding(check, REFUSE, text, key='nominal')
+
+
+def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """Angular rate is in rad/s: gravity turns by the integral of the rates."""
+    turning = evidence.turning
+    largest = max((end.level for pair in evidence.ends[3:] for end in pair), default=0.0)
+    convert = 'convert them in the driver'
+    if turning is not None:
+        ratio = 1.0 / turning.factor
+        came = f'angular rates must be in rad/s, they are {significant(ratio)} times the rotation of the measured gravity: '
+        if 0.6 < ratio * DEG < 1.6:
+            yield _unit('rate_unit',
+                        f'{came}probably deg/s, gyroscope_scale 57.29578; {convert}')
+        elif 0.6 < ratio / DEG < 1.6:
+            yield _unit('rate_unit', f'{came}probably converted from deg/s twice, gyroscope_scale 0.01745329; convert them once')
+        elif _full_scale(evidence) is not None:
+            return
+        elif not 0.5 < ratio < 2.0:
+            yield _unit('rate_unit', f'{came}counts or volts?; {convert}')
+        else:
+            yield CheckFinding('rate_unit', GOOD, f'angular rate in rad/s: gravity rotates according to the rates{_about(turning.axes)}')
+    elif largest > FASTEST:
+        unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
+        yield _unit('rate_unit', f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
+                                 f'{convert}')
+
+
+def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """The driver converts for the set full-scale range: gravity turns from rest to rest by the integral of the rates."""
+    factor = _full_scale(evidence)
+    if factor is None:
+        return
+    came = f'angular rates are {factor:.3g} times the rotation of gravity from one rest to the next'
+    if abs(np.log2(factor)) % 1 == 0:
+        yield CheckFinding('full_scale', WARNING,
+                           f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set; correct its '
+                      'setting (a calibration would include the factor in the matrix, and be wrong after the correction)')
+    else:
+        yield CheckFinding('full_scale', WARNING,
+                           f'{came}: the scale of the driver is wrong; correct it, or check that the IMU was at rest')
+
+
+def _full_scale(evidence):
+    """Return the factor of the rates if a wrong full-scale range may explain it, else None."""
+    factor, turning = evidence.rate_factor, evidence.turning
+    if factor is None and turning is not None:   # no rests available
+        factor = nearest_power(1.0 / turning.factor)
+        factor = factor if np.log2(factor) % 1 == 0 else None
+    return factor if factor is not None and factor != 1.0 and FACTORS[0] < factor < FACTORS[-1] else None
+
+
+def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """Accelerometer and gyroscope have the same axes: gravity turns the way the rates turn."""
+    turning = evidence.turning
+    if turning is None:
+        return
+    match = match_axes(turning.matrix, turning.seen)
+    if not match.wrong:
+        if turning.everywhere:
+            yield CheckFinding('handedness', GOOD, 'accelerometer and gyroscope share right-handed axes')
+        return
+    what = ', '.join(f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}" for i, j,
+                     sign in match.exchanges(turning.seen))
+    if not what or match.agreement < CLEAR:
+        what = 'no exchange of axes makes them fit'
+    kinds = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}
+    kind = kinds.get((match.turned, match.mirrored), 'turned or left-handed, not separable in this recording')
+    yield CheckFinding('handedness', REFUSE,
+                       'accelerometer and gyroscope must share right-handed axes, gravity does not rotate according to the rates: '
+                  f'{what} ({kind}); correct signs and order of the axes in the driver')
+
+
+def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """No output piles up at the end of its range."""
+    for sensor, part, unit in CHANNELS:
+        fine = evidence.quiet_range[part] > FINE * evidence.resolution[part]
+        least = CLIP_RATE * evidence.quiet_range[part]
+        if sensor == 'accelerometer':
+            least = np.where(fine, least, CLIP_FORCE * (evidence.length or 0.0))
+        else:
+            least = np.maximum(least, LEAST_RANGE)
+        held = _held(evidence, sensor)
+        words, total, level = [], 0, 0.0
+        for axis, ends in enumerate(evidence.ends[part]):
+            counts = [_clipped(end, sign * held[:, axis], evidence.chunks.size) if end.level > least[axis] and (fine[axis] or end.jumped)
+                      else 0 for sign, end in zip((1, -1), ends)]
+            if sum(counts):
+                words.append(f'{"xyz"[axis]} {sum(counts)}')
+                total, level = total + sum(counts), max([level, *(end.level for end, count in zip(ends, counts) if count)])
+        if words:
+            people = f' ({level / DEG:.0f} deg/s)' if unit == 'rad/s' else f' ({level / STANDARD_GRAVITY:.1f} g)'
+            yield CheckFinding('clipping', WARNING,
+                               f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at the end of the range; '
+                          'larger values are lost, move less or choose a wider range', samples=total)
+
+
+def _held(evidence, sensor):
+    """Return the readings of the chunks in which a sensor is frozen, shape (n, 3)."""
+    return evidence.chunks.mean[evidence.frozen[sensor]][:, SENSOR_COLUMNS[sensor]]
+
+
+def _clipped(end, held, size):
+    """Return how many readings are at the end of the range; a pile that is a frozen stretch with its two ends is none."""
+    frozen = size * int(np.isclose(held, end.level, rtol=1e-9).sum())
+    return end.n_clipped if not frozen or end.n_clipped > frozen + 2 * size else 0
+
+
+def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """The biases are such as sensors have."""
+    rest = evidence.rest
+    if rest is None or rest.bias is None or not 3.0 < evidence.length < 30.0:
+        return   # with few attitudes, a steady spin about the vertical is not distinguishable from rest
+    found = {'accelerometer': rest.bias, 'gyroscope': rest.rate}
+    for sensor, _, unit in CHANNELS:
+        size = float(np.linalg.norm(found[sensor]))
+        if size > MOST_BIAS[sensor]:
+            people = f'{size / STANDARD_GRAVITY:.2f} g' if sensor == 'accelerometer' else f'{size / DEG:.0f} deg/s'
+            values = ', '.join(f'{value:+.2f}' for value in found[sensor])
+            yield CheckFinding('bias', WARNING,
+                               f'the bias of the {sensor} is {people} ([{values}] {unit}), more than any grade of sensor has; check '
+                          'offsets in the driver, the supply and the soldering of the sensor')
+
+
+def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """The accelerometer reads local gravity within 2 per cent."""
+    rest = evidence.rest
+    if rest is None or not 3.0 < evidence.length < 30.0:
+        return
+    off = rest.length / evidence.gravity - 1
+    if rest.sphere is not None:
+        bias = np.linalg.norm(rest.sphere[0])
+        what = f'{len(rest.force)} poses, bias of {bias:.2f} m/s^2 subtracted'
+    else:
+        what = f'median of {len(rest.force)} stretches' if len(rest.force) > 1 else 'one stretch'
+    if abs(off) > GRAVITY_SHARE:
+        yield CheckFinding('gravity', WARNING,
+                           f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, '
+                           f'the accelerometer reads {rest.length:.3f} ({what}), '
+                      f'{100 * off:+.1f} %: scale or bias is wrong (gravity differs by '
+                      f'{100 * PLACE} % between sites)')
+    else:
+        yield CheckFinding('gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})')
+
+
+def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """Every message carries a new measurement."""
+    frozen = evidence.chunks.size * int(np.logical_and(*evidence.frozen.values()).sum())
+    share = (evidence.n_repeated - frozen) / max(evidence.n_samples, 1)
+    if share > REPEATED_SHARE and evidence.quiet_range.all():
+        yield CheckFinding('repeated_readings', WARNING,
+                           f'{100 * share:.0f} % of the samples repeat all six readings of the one before: '
+                           'the driver publishes faster than '
+                      'the sensor measures, and noise is underestimated; publish each measurement once')
+
+
+def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """The step of the converter is finer than the noise."""
+    if evidence.rest is None:
+        return
+    for sensor, part, unit in CHANNELS:
+        step, range_ = evidence.resolution[part], evidence.rest.range[part]
+        # Rounding shows as few different readings; noise of one sd spans about four in a chunk.
+        coarse = (step > ROUNDING) & (4 * step > range_)
+        constant = coarse & (range_ == 0)
+        if coarse.any():
+            size = step[coarse].max()
+            people = f'{size / DEG:.2g} deg/s' if unit == 'rad/s' else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
+            yield CheckFinding('resolution', NOTE,
+                               f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}'
+                               + (f' and constant at rest on {_axes(constant)}' if constant.any() else '')
+                               + ': means over short windows are rounded too; the noise is at least step/sqrt(12)')
+
+
+def temperature(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """Temperatures are in degrees Celsius."""
+    if evidence.temperature_c is None:
+        return
+    low, high = evidence.temperature_c
+    if low < -80 or high > 180:
+        kelvin = ': kelvin?' if 200 < low and high < 450 else ''
+        yield CheckFinding('temperature', WARNING,
+                           f'temperature must be in degrees Celsius, it lies between {low:.1f} and {high:.1f}{kelvin}; '
+                           'convert it in the driver')
+    else:
+        yield CheckFinding('temperature', GOOD, f'temperature {low:.1f} to {high:.1f} degrees Celsius')
+
+
+def _axes(flags):
+    return ', '.join(np.array(list('xyz'))[np.asarray(flags, bool)])
+
+
+def _about(flags):
+    return f' about {_axes(flags)}' if np.any(flags) else ''

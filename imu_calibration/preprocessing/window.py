@@ -1,0 +1,198 @@
+"""Windows, their construction from samples, and the settings of the segmentation."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from imu_calibration.core.samples import _Columns
+from imu_calibration.core.settings import setting
+from imu_calibration.kinematics.joint_motion import JointMotion
+
+
+class WindowKind(StrEnum):
+    """Motion of the IMU in a window."""
+
+    UNUSED = 'unused'
+    """Excluded on purpose."""
+    STATIC = 'static'
+    """It rests."""
+    SPIN = 'spin'
+    """All joint rates are constant, and one joint turns."""
+    DYNAMIC = 'dynamic'
+    """Any other motion."""
+
+
+class UnusedReason(StrEnum):
+    """Reason for which complete samples are in no window of a kind."""
+
+    NONE = ''
+    SETTLING = 'settling'
+    NOT_QUIET = 'not quiet'
+    TURN_ON = 'turn-on'
+    TOO_SHORT = 'too short'
+    REST_TOO_SHORT = 'rest too short'
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A stretch of samples of one kind, without gaps."""
+
+    kind: WindowKind
+    """Kind of motion."""
+    stamp_ns: np.ndarray
+    """Header stamps, int64, shape (n,)."""
+    time: np.ndarray
+    """Seconds since the session's first IMU sample, shape (n,); continues across clock resets."""
+    force_s: np.ndarray
+    """Measured specific force, m/s^2, shape (n, 3)."""
+    rate_s: np.ndarray
+    """Measured angular rate, rad/s, shape (n, 3)."""
+    motion: JointMotion
+    """The joints at the IMU's stamps; one row at rest: mean position, and rates of zero unless the joints creep significantly."""
+    temperature_c: np.ndarray | None = None
+    """Temperature at the samples, degrees Celsius, shape (n,), or None."""
+    reason: UnusedReason = UnusedReason.NONE
+    """Why the window is unused."""
+    joint_step: np.ndarray | None = None
+    """Steps of the encoders visible in the readings, rad, zero where none are, shape (n_joints,)."""
+    corrected: np.ndarray | None = None
+    """See `ImuSamples`."""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def period(self) -> float:
+        """Median sampling period, s; 0 for one sample."""
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 0.0
+
+    @property
+    def noise_sd(self) -> np.ndarray:
+        """White noise of specific force and angular rate from second differences, shape (2, 3); smooth motion cancels."""
+        second = np.diff(np.stack([self.force_s, self.rate_s]), 2, axis=1)
+        return second.std(axis=1) / np.sqrt(6) if second.shape[1] > 1 else np.full((2, 3), np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class PhasedSamples(_Columns):
+    """IMU samples with the motion of the joints."""
+
+    stamp_ns: np.ndarray
+    """Header stamps, shape (n,)."""
+    time: np.ndarray
+    """Session time, s, shape (n,)."""
+    force_s: np.ndarray
+    """Shape (n, 3)."""
+    rate_s: np.ndarray
+    """Shape (n, 3)."""
+    position: np.ndarray
+    """Joint angles, shape (n, n_joints); the three below are their derivatives, zero where the joints rest."""
+    joint_rate: np.ndarray
+    """Shape (n, n_joints)."""
+    acceleration: np.ndarray
+    """Shape (n, n_joints)."""
+    jerk: np.ndarray
+    """Shape (n, n_joints)."""
+    temperature_c: np.ndarray
+    """NaN where unknown, shape (n,)."""
+    thermal_branch: np.ndarray
+    """Thermal branch (direction of the temperature change), NaN where it is unknown, shape (n,)."""
+    vibration: np.ndarray
+    """Variance of the vibration (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3)."""
+    phase: np.ndarray
+    """STILL, STEADY or MOVING, shape (n,)."""
+    quiet: np.ndarray
+    """Whether the IMU is as quiet as at rest, shape (n,)."""
+    after_gap: np.ndarray
+    """Whether a window cannot continue from the sample before, shape (n,)."""
+    after_loss: np.ndarray
+    """Whether the joints were unknown just before, shape (n,)."""
+    joint_step: np.ndarray
+    """Steps of the encoders, rad, zero where none are visible, shape (n, n_joints)."""
+    corrected: np.ndarray | None = None
+    """See `ImuSamples`."""
+
+
+def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason = UnusedReason.NONE) -> Window:
+    """Return the `Window` of a kind that holds all of `samples`."""
+    temperature = None if np.isnan(samples.temperature_c).any() else samples.temperature_c
+    moving = JointMotion(samples.time, samples.position, samples.joint_rate, samples.acceleration, samples.jerk,
+                         None if temperature is None else samples.thermal_branch, samples.vibration)
+    motion = _mean_motion(samples) if kind == WindowKind.STATIC else moving
+    return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason,
+                  samples.joint_step.max(axis=0), samples.corrected)
+
+
+CHUNK = 4096
+"""Samples whose columns or predictions are in memory at once."""
+
+
+def chunks(windows: Sequence[Window]) -> Iterator[list[Window]]:
+    """Yield the windows in groups of more than `CHUNK` samples, in order."""
+    part, size = [], 0
+    for window in windows:
+        part.append(window)
+        size += len(window.motion)
+        if size > CHUNK:
+            yield part
+            part, size = [], 0
+    if part:
+        yield part
+
+
+def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None, np.ndarray]:
+    """Return the motion of all windows, their temperatures or None, and for each sample the row of the motion that belongs to it."""
+    motion = JointMotion.joined([window.motion for window in windows])
+    lengths = [len(w.motion) for w in windows]
+    starts = np.cumsum([0] + lengths)
+    rows = np.concatenate([np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
+                           for w, s, n in zip(windows, starts, lengths)])
+    known = [(w.temperature_c, n) for w, n in zip(windows, lengths) if w.temperature_c is not None]
+    if len(known) < len(windows):
+        return motion, None, rows
+    parts = [warm if n == len(warm) else np.full(n, warm.mean()) for warm, n in known]
+    return motion, np.concatenate(parts), rows
+
+
+def _mean_motion(samples):
+    """Return one row: the mean position and, when the slope of a straight line is significant, this slope."""
+    mean = samples.position.mean(axis=0)
+    some = slice(None, None, max(1, len(samples) // 500))  # the levels are averages over 0.2 s, so these contain the same information
+    time, position = samples.time[some] - samples.time[some].mean(), samples.position[some] - mean
+    slope = time @ position / max(time @ time, 1e-12)
+    rest = (position - time[:, None] * slope).std(axis=0)
+    distance = np.abs(slope) * (time[-1] - time[0])
+    # one encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no creep
+    slope = np.where((distance > 8 * rest) & (distance > 1e-6), slope, 0.0)
+    zero, branch = np.zeros((1, len(mean))), samples.thermal_branch.mean(keepdims=True)
+    return JointMotion(samples.time.mean(keepdims=True), mean[None], slope[None], zero, zero, None if np.isnan(branch).any() else branch,
+                       samples.vibration.mean(axis=0, keepdims=True))
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """Settings for static windows, constant-rate spins and dynamic stretches."""
+
+    static_rate: float = setting(0.002, 'rad/s', 'joints slower than this, and the IMU quiet, count as at rest', (0.0, 1.0),
+                                 'too small: no static windows; too large: slow creep enters the means', live=True)
+    quiet_ratio: float = setting(3.0, '1', 'at rest the IMU may scatter by this factor more than where it is quietest', (1.2, 100.0),
+                                 'too small: no static windows; too large: knocks and vibration enter the means', live=True)
+    settling: float = setting(0.5, 's', 'kept out after a joint stops and after a ramp ends', (0.0, 60.0),
+                              'too small: ringing of the table shows as between-window variance', live=True)
+    turn_on: float = setting(0.0, 's', 'kept out at the start of a recording', (0.0, 3600.0),
+                             'too small: the turn-on transient shows as bias drift', fixed='the session has begun')
+    static_minimum: float = setting(1.0, 's', 'shortest static window', (0.05, 600.0), 'too large: short poses are lost', live=True)
+    window_maximum: float = setting(20.0, 's', 'longer windows are cut, which bounds memory', (1.0, 600.0),
+                                    'too large: bias wander inside a window; too small: windows no longer independent', live=True)
+    spin_rate_variation: float = setting(0.01, '1', 'largest relative change of each joint rate in a constant-rate spin', (0.0, 0.5),
+                                         'too small: spins are treated as dynamic stretches', live=True)
+    spin_minimum: float = setting(1.0, 's', 'shortest constant-rate spin', (0.05, 600.0), live=True)
+    dynamic_minimum: float = setting(0.3, 's', 'shortest dynamic stretch', (0.05, 600.0), live=True)
+    gap: float = setting(0.1, 's', 'a longer hole in either stream ends a window; also never below five IMU periods', (0.001, 60.0),
+                         'too small: every lost message cuts a window', live=True)
+    chunk: float = setting(20.0, 's', 'the joints are smoothed in pieces of this length', (2.0, 600.0),
+                           fixed='the pieces count from the first sample on')
+    overlap: float = setting(2.0, 's', 'margin on both sides of a piece, so that its ends do not show', (0.2, 60.0),
+                             fixed='the pieces count from the first sample on')

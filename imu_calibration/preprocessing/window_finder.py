@@ -1,0 +1,199 @@
+"""Windows from streams: blocks are converted to static, spinning and dynamic windows with the joints' motion."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import JointSamples, NominalScaling, SampleBlock
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.block_cleaning import STREAMS, BlockCleaner, Watcher
+from imu_calibration.preprocessing.quiet_detector import QuietFloor
+from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT, MotionChunks
+from imu_calibration.preprocessing.window import UnusedReason, Window, WindowKind, WindowSettings
+from imu_calibration.preprocessing.window_cutter import WindowCutter
+
+
+class MotionGatherer:
+    """
+    Converts streams to windows, in bounded memory; the result does not depend on the division of the streams into blocks.
+
+    Cleaning is done by the `BlockCleaner`; `stream_alignment.MotionChunks` interpolates the joints at the IMU's stamps; `WindowCutter`
+    makes the windows. After a clock reset the first two restart.
+    Streams may differ in delay by a minute (temperature: five seconds); later samples are not used.
+
+    Parameters
+    ----------
+    table : Table or None
+        Names of the joints and their noise; None accepts the joints of the stream in their order.
+    settings : WindowSettings
+    keep_unused : bool
+        Also return windows of kind 'unused', so that every accepted sample is in exactly one window, in order.
+    nominal, watchers
+        As for the `BlockCleaner`.
+
+    """
+
+    def __init__(self, table: Table, settings: WindowSettings = WindowSettings(), keep_unused: bool = False, *,
+                 nominal: NominalScaling | None = None, watchers: Sequence[Watcher] = ()):
+        self.cleaner = BlockCleaner(() if table is None else table.joint_names, nominal, watchers)
+        self._settings, self._noise_rad = settings, None if table is None else table.joint_noise_rad
+        self._queue = {name: [] for name in STREAMS}
+        self._epoch_shift = dict.fromkeys(STREAMS, 0)
+        self._turns = _Unwrapper()
+        self._floors = QuietFloor(), QuietFloor()
+        self._lost_counts = {}
+        self._epoch = 0
+        self._chunks = MotionChunks(settings, self._noise_rad, self._floors)
+        self._cutter = WindowCutter(settings, self._chunks.short_rest, keep_unused)
+
+    @property
+    def n_buffered(self) -> int:
+        """Number of buffered samples; bounded for a session of any length."""
+        waiting = sum(len(part) for name in STREAMS for _, part in self._queue[name])
+        return self.cleaner.n_buffered + waiting + self._chunks.n_buffered + self._cutter.n_waiting
+
+    @property
+    def counts(self) -> dict[str | UnusedReason | WindowKind, int]:
+        """
+        Return reason -> number of samples.
+
+        'static', 'spin', 'dynamic': in windows. 'settling', 'not quiet', 'turn-on', 'too short', 'rest too short': accepted, but in
+        no window.
+        'edge of joints': just before the first or after the last joint state, in motion. 'no joint state', 'late IMU sample',
+        'imu not finite', 'joints repeated stamp', ...: dropped; 'imu clock reset': jumps. Drops reported by blocks are not included.
+        """
+        counts = self.cleaner.counts
+        for source in (self._lost_counts, self._chunks.counts, self._cutter.counts):
+            _add_counts(counts, source)
+        return counts
+
+    def push(self, block: SampleBlock) -> list[Window]:
+        """
+        Add a block and return the windows that are complete now.
+
+        Raises
+        ------
+        InputError
+            When the joints of the block differ from the table's.
+
+        """
+        cleaned = self.cleaner.push(block)
+        self._enqueue(cleaned)
+        return self._work() if cleaned else []
+
+    def finish(self) -> list[Window]:
+        """Return the remaining windows; no block may be added after this."""
+        self._enqueue(self.cleaner.finish())
+        windows = self._work()
+        while any(epoch > self._epoch for name in STREAMS for epoch, _ in self._queue[name]):
+            windows += self._next_epoch() + self._work()
+        return windows + self._end_epoch() + self._cutter.push(None, final=True)
+
+    def change(self, settings: WindowSettings) -> None:
+        """
+        Use other settings from now on.
+
+        Raises
+        ------
+        InputError
+            When the pieces of joint smoothing, or the excluded time at the start, would change.
+
+        """
+        for name in ('chunk', 'overlap', 'turn_on'):
+            if getattr(settings, name) != getattr(self._settings, name):
+                raise InputError(f"setting '{name}' must not change during a session; restart with it")
+        self._settings = settings
+        self._chunks.change(settings)
+        self._cutter.change(settings, self._chunks.short_rest)
+
+    def all_of(self, blocks: Iterable[SampleBlock]) -> list[Window]:
+        """Return the windows of a recording."""
+        return [window for block in blocks for window in self.push(block)] + self.finish()
+
+    def _enqueue(self, cleaned):
+        """Queue samples by epoch."""
+        for name in STREAMS:
+            for epoch, samples in getattr(cleaned, name):
+                self._queue[name].append((epoch + self._epoch_shift[name], self._turns.unwrap(samples) if name == 'joints' else samples))
+
+    def _work(self):
+        """Process the samples of this epoch; advance to the next epoch when the streams have."""
+        windows = []
+        while True:
+            for name in STREAMS:
+                for epoch, part in self._queue[name]:
+                    if epoch == self._epoch:  # remaining samples of an earlier epoch arrived after its end: late temperatures
+                        self._chunks.add(**{name: part})
+                self._queue[name] = [(epoch, part) for epoch, part in self._queue[name] if epoch > self._epoch]
+            windows += self._cut(self._chunks.take())
+            if not self._epoch_is_over():
+                self._forget_temperature()
+                return windows
+            windows += self._next_epoch()
+
+    def _epoch_is_over(self):
+        """Return whether the clocks of IMU and joints were both reset, or only one and the other did not follow in time."""
+        queues = [self._queue['imu'], self._queue['joints']]
+        return all(queues) or any(queue and _span(queue) > JOINT_WAIT for queue in queues)
+
+    def _next_epoch(self):
+        windows = self._end_epoch()
+        old, self._chunks = self._chunks, MotionChunks(self._settings, self._noise_rad, self._floors)
+        self._chunks.time_origin = old.end_time + self._settings.gap
+        _add_counts(self._lost_counts, old.counts)
+        self._epoch += 1
+        if not (self._queue['imu'] and self._queue['joints']):
+            self._follow(old)
+        return windows
+
+    def _follow(self, old):
+        """Continue streams without a clock reset in the new epoch: only one clock was reset."""
+        if not self._queue['joints']:
+            self._chunks.add(joints=old.joints_left())
+        for name in STREAMS:
+            if not self._queue[name]:
+                self._epoch_shift[name] = self._epoch - self.cleaner.epoch(name)
+
+    def _forget_temperature(self):
+        """Bound the buffer of temperatures of an epoch that the other streams do not begin."""
+        queue = self._queue['temperature']
+        while len(queue) > 1 and _span(queue) > JOINT_WAIT:
+            del queue[0]
+
+    def _end_epoch(self):
+        return self._cut(self._chunks.take(final=True))
+
+    def _cut(self, chunks):
+        return [window for chunk in chunks for window in self._cutter.push(chunk)]
+
+
+class _Unwrapper:
+    """Removes jumps of joint angles by full turns, sample by sample."""
+
+    def __init__(self):
+        self._last = None
+        self._turns = 0
+
+    def unwrap(self, joints):
+        """Return the joints without jumps of more than half a turn."""
+        if not len(joints):
+            return joints
+        last = joints.position[:1] if self._last is None else self._last
+        step = np.diff(np.concatenate([last, joints.position]), axis=0)
+        self._last = joints.position[-1:].copy()
+        turns = self._turns + np.cumsum(np.rint(step / (2 * np.pi)).astype(np.int64), axis=0)
+        self._turns = turns[-1]
+        if not turns.any():
+            return joints
+        return JointSamples(joints.stamp_ns, joints.position - 2 * np.pi * turns, joints.velocity, joints.names)
+
+
+def _add_counts(total, counts):
+    for reason, number in counts.items():
+        total[reason] = total.get(reason, 0) + number
+
+
+def _span(queue):
+    first, last = queue[0][1].stamp_ns[0], queue[-1][1].stamp_ns[-1]
+    return abs(int(last) - int(first)) / 1e9

@@ -1,0 +1,118 @@
+"""Drift of biases within the recording, estimated from the poses together with all parameters."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import fdtrc
+
+from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
+from imu_calibration.references.gravity.equations import Poses
+from imu_calibration.references.gravity.hand_parameters import ACCELEROMETER, GYRO_BIAS, HandModel
+
+P_VALUE = 1e-3
+"""A drift is significant below this p-value."""
+SPARE = 6
+"""Least number of poses beyond the columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class BiasMovement:
+    """The smooth course of one sensor's bias over the poses."""
+
+    course: np.ndarray
+    """Departure from its mean in each pose, shape (k, 3), m/s^2 or rad/s."""
+    growth: np.ndarray
+    """Factor by which the sds of the sensor's bias and matrix grow when the drift is estimated too, shape (n,)."""
+
+    @property
+    def size(self) -> np.ndarray:
+        """Largest minus smallest on each axis, shape (3,)."""
+        return np.ptp(self.course, axis=0)
+
+
+def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[str, BiasMovement]:
+    """Return sensor -> `BiasMovement` of the biases that move beyond the scatter from pose to pose (F test of a parabola in time)."""
+    if not np.ptp(poses.time) > 0:
+        return {}
+    time = (poses.time - poses.time.mean()) / np.ptp(poses.time)
+    residual, columns = model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
+    true = model.compensate(values, poses.force, np.zeros_like(poses.force), time=poses.time, temperature_c=poses.temperature_c)[0]
+    more = model.further('gyroscope', values, true, rate=np.zeros_like(true), time=poses.time, temperature_c=poses.temperature_c)[0]
+    turning = (poses.rate - values[GYRO_BIAS] - more)
+    found = {'accelerometer': _of_norms(time, residual, columns[:, ACCELEROMETER]), 'gyroscope': _of_rates(time, turning)}
+    return {sensor: movement for sensor, movement in found.items() if movement is not None}
+
+
+def _powers(time, count):
+    """Return time and, with enough poses, its square, without their means, shape (k, 1 or 2)."""
+    powers = np.column_stack([time, time**2][:2 if count >= 2 * SPARE else 1])
+    return powers - powers.mean(axis=0)
+
+
+def _of_norms(time, residual, base):
+    """The drift of the accelerometer's bias: only its component along gravity is observable in a pose."""
+    back = base[:, 0:3]
+    powers = _powers(time, len(time) - base.shape[1] - 3)
+    added = np.hstack([power[:, None] * back for power in powers.T])
+    known, new = _orthonormal(base), _orthonormal(np.hstack([base, added]))
+    spare = len(time) - new.shape[1]
+    if spare < SPARE or not _shown(*(np.sum((residual - basis @ (basis.T @ residual))**2) for basis in (known, new)),
+                                   new.shape[1] - known.shape[1], spare):
+        return None
+    both = np.hstack([base, added])
+    fitted = np.linalg.lstsq(both, residual, rcond=1e-9)[0][base.shape[1]:].reshape(-1, 3)
+    alone, beside = (np.diag(np.linalg.pinv(part.T @ part))[:base.shape[1]] for part in (base, both))
+    return BiasMovement(powers @ fitted, np.sqrt(np.maximum(beside / np.maximum(alone, 1e-300), 1.0)))
+
+
+def _of_rates(time, rates):
+    powers = _powers(time, len(time))
+    spare = 3 * (len(time) - 1 - powers.shape[1])
+    if spare < 3 * SPARE:
+        return None
+    rates = rates - rates.mean(axis=0)
+    course = powers @ np.linalg.lstsq(powers, rates, rcond=None)[0]
+    scale = np.mean((rates - course)**2, axis=0) + 1e-300
+    if not _shown(np.sum(rates**2 / scale), np.sum((rates - course)**2 / scale), 3 * powers.shape[1], spare):
+        return None
+    return BiasMovement(course, np.ones(12))
+
+
+def _orthonormal(columns):
+    left, singular, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+    return left[:, singular > 1e-6 * singular[0]]
+
+
+def _shown(before, after, added, spare):
+    ratio = (before - after) / max(added, 1) / max(after / spare, 1e-300)
+    return added > 0 and fdtrc(added, spare, max(ratio, 0.0)) < P_VALUE
+
+
+def without_movement(poses: Poses, movements: Mapping[str, BiasMovement]) -> Poses:
+    """Return the poses with the accelerometer's bias at its mean; the gyroscope's may differ between poses anyway."""
+    moved = movements.get('accelerometer')
+    return poses if moved is None else replace(poses, force=poses.force - moved.course)
+
+
+def with_movement(covariance: np.ndarray, model: HandModel, movements: Mapping[str, BiasMovement]) -> np.ndarray:
+    """Return the covariance with the drift: the bias at any time of the recording is within one sd of the reported mean."""
+    grown = covariance.copy()
+    for sensor, movement in movements.items():
+        index = model.index_of(sensor)[:len(movement.growth)]
+        factor = np.ones(model.size)
+        factor[index] = movement.growth
+        grown *= np.outer(factor, factor)
+        grown[index[:3], index[:3]] += (movement.size / 2)**2
+    return grown
+
+
+def notes(moved: Mapping[str, float], duration: float) -> tuple[CheckFinding, ...]:
+    """Return the notes for the user: sensor -> distance moved in SI, over `duration` s."""
+    span = f'{duration / 60:.0f} minutes' if duration >= 90 else f'{duration:.0f} s'
+    sizes = {'accelerometer': (1e3 / STANDARD_GRAVITY, 'mg'), 'gyroscope': (1 / DEG, 'deg/s')}
+    return tuple(CheckFinding('bias_drift', WARNING, f'{sensor} bias moved by {size * sizes[sensor][0]:.2g} {sizes[sensor][1]} in {span}, '
+                              'which is in its sd; let the sensor warm up before recording, '
+                              'or record imu/temperature and request a thermal bias')
+                              for sensor, size in moved.items())

@@ -1,0 +1,177 @@
+"""A recording without a table as rows of linear equations: norms of gravity in poses, rates at rest, directions after turns."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.effects.base import SENSORS, Effect
+from imu_calibration.effects.sensor_model import BASE
+from imu_calibration.kinematics.preintegration import integrate_turn
+from imu_calibration.kinematics.reference_motion import skew
+from imu_calibration.references.gravity.equations import TurnData, between_middles, tangent
+from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
+from imu_calibration.references.gravity.hand_calibration import HandCalibration
+from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.selection.bias_process_search import NATURAL
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Rows of one kind, ``residual = columns @ parameters + error``, in the unit of their sensor."""
+
+    name: str
+    """'poses' or 'turns'."""
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    rows: np.ndarray
+    """``[columns | residual]`` at the baseline, shape (m, n_axes, q + 1); different axes have independent errors."""
+    known: np.ndarray
+    """Variance by the noise of the samples, shape (m, n_axes)."""
+    floor: np.ndarray
+    """The same plus the usual bias drift, shape (m, n_axes)."""
+    pose: np.ndarray
+    """Pose of each row (of a turn: the pose before it), shape (m,)."""
+    time: np.ndarray
+    """Seconds since the first sample, shape (m,)."""
+    duration: np.ndarray | None = None
+    """Of each turn, s, shape (m,): residuals of turns times it are angles; None for poses."""
+
+    def select(self, keep: np.ndarray) -> 'Block':
+        """Return the rows at a mask."""
+        return replace(self, **{name: getattr(self, name)[keep] for name in ('rows', 'known', 'floor', 'pose', 'time', 'duration')
+                                if getattr(self, name) is not None})
+
+
+@dataclass(frozen=True, eq=False)
+class HandSpace:
+    """Parameters of a diagnosis by hand: baseline, Earth's rate about the vertical, then one run per column set."""
+
+    names: tuple
+    """Label of each run of columns: effect name, for a warm-up with the number of its time constant."""
+    parts: dict
+    """Label -> slice."""
+    prior_sd: np.ndarray
+    """Shape (q,); wide for the baseline, which is linearised at its own solution."""
+    size: int
+    """Number of parameters."""
+
+
+def build_rows(hand: HandCalibration, turns: Sequence[TurnData], effects: Sequence[Effect], *,
+               constants: np.ndarray) -> tuple[list[Block], HandSpace]:
+    """
+    Return (blocks, HandSpace).
+
+    Parameters
+    ----------
+    hand : HandCalibration
+        Of the baseline.
+    turns : list of TurnData
+        Between consecutive poses.
+    effects : sequence of Effect
+        Effects under test.
+    constants : array
+        Time constants of warm-ups under test, s.
+
+    """
+    sets: list[tuple[Effect, str, float | None]] = [(effect, effect.name, None) for effect in effects if not effect.time_constant]
+    sets += [(e, f'{e.name}@{k}', float(tau)) for e in effects if e.time_constant for k, tau in enumerate(constants)]
+    base = hand.model.size
+    sizes = [len(effect.amplitudes(effect.components)) for effect, _, _ in sets]
+    ends = np.cumsum([base + 1] + sizes)
+    widths = np.concatenate([1e3 * hand.model.priors, [EARTH_UPWARDS_SD], *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes))])
+    parts = {label: slice(a, b) for (_, label, _), a, b in zip(sets, ends, ends[1:])}
+    space = HandSpace(tuple(parts), parts, widths, int(ends[-1]))
+    at_rest = {label: _columns(hand, effect, tau, hand.gravity * hand.state.up, np.zeros_like(hand.state.up), hand.poses.time,
+                               hand.poses.temperature_c)[:, :, :space.parts[label].stop - space.parts[label].start] for effect, label,
+               tau in sets}
+    sensor_of = {label: effect.sensor for effect, label, _ in sets}
+    moving = [effect for effect, label, tau in sets if effect.sensor == 'gyroscope' and tau is None]
+    blocks = [_norm_block(hand, space, at_rest, sensor_of), _rest_block(hand, space, at_rest, sensor_of)]
+    gravity_turns = [turn for turn in turns if turn.rotation is None]
+    if gravity_turns:
+        blocks.append(_turn_block(hand, gravity_turns, space, at_rest, moving))
+    return blocks, space
+
+
+def _columns(hand, effect, tau, force, rate, time, temperature_c):
+    """Return the contribution of the effect's parameters to its sensor's output, shape (m, 3, p), at the baseline's solution."""
+    point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
+    names = {sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS}
+    model = HandModel(replace(hand.model.model, **names, point=point), hand.gravity)
+    known = dict(zip(hand.model.param_names, hand.state.values))
+    values = np.array([known.get(name, value) for name, value in zip(model.param_names, model.nominal)])
+    return model.further(effect.sensor, values, force, rate=rate, time=time, temperature_c=temperature_c)[1]
+
+
+def _natural(poses, sensor):
+    """Return the variance of the usual bias drift, shape (3,)."""
+    return NATURAL**2 * poses.noise[sensor].white_variance * poses.period
+
+
+def _norm_block(hand, space, at_rest, sensor_of):
+    """One row per pose: ``|true force| - gravity``."""
+    poses, count = hand.poses, len(hand.poses.start)
+    residual, base = hand.model.norm_rows(hand.state.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
+    back = base[:, 0:3]
+    rows = np.zeros((count, space.size + 1))
+    rows[:, :base.shape[1]], rows[:, -1] = base, residual
+    for label, columns in at_rest.items():
+        if sensor_of[label] == 'accelerometer':
+            rows[:, space.parts[label]] = np.einsum('ki,kip->kp', back, columns)
+    known = np.sum((back * poses.force_sem)**2, axis=1)
+    floor = known + back**2 @ _natural(poses, 'accelerometer')
+    return Block('poses', 'accelerometer', rows[:, None], known[:, None], floor[:, None], np.arange(count), poses.time)
+
+
+def _rest_block(hand, space, at_rest, sensor_of):
+    """Three rows per pose: the rate at rest, with the Earth's rate about the vertical."""
+    poses, count = hand.poses, len(hand.poses.start)
+    true = hand.gravity * hand.state.up
+    more, slopes = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time,
+                                      temperature_c=poses.temperature_c)
+    rows = np.zeros((count, 3, space.size + 1))
+    rows[:, :, 9:12] = np.eye(3)
+    rows[:, :, hand.model.size] = hand.state.up
+    rows[:, :, hand.model.extra_index('gyroscope')] = slopes
+    rows[:, :, -1] = poses.rate - hand.gyroscope[0] - more
+    for label, columns in at_rest.items():
+        if sensor_of[label] == 'gyroscope':
+            rows[:, :, space.parts[label]] = columns
+    known = poses.rate_sem**2
+    floor = known + _natural(poses, 'gyroscope')
+    return Block('poses', 'gyroscope', rows, known, floor, np.arange(count), poses.time)
+
+
+def _turn_block(hand, turns, space, at_rest, moving):
+    """
+    Two rows per turn: the direction after it against the direction before it rotated by the rates, over the turn's duration.
+
+    The bias in a turn is the mean of the rates at rest before and after it, which removes its drift; the contributions of
+    further effects at rest are removed with it.
+    """
+    bias_f, matrix_f = hand.accelerometer
+    matrix = hand.gyroscope[1]
+    across, rows, known, durations = tangent(hand.state.up), [], [], []
+    for turn in turns:
+        i, j = turn.first, turn.last
+        bias = 0.5 * (hand.poses.rate[i] + hand.poses.rate[j])
+        force, rate = np.linalg.solve(matrix_f, (turn.force - bias_f).T).T, np.linalg.solve(matrix, (turn.rate - bias).T).T
+        further = [_columns(hand, e, None, force, rate, turn.time, turn.temperature_c) - 0.5 * (at_rest[e.name][i] + at_rest[e.name][j])
+                   for e in moving]
+        stacked = np.concatenate([np.zeros((len(force), 3, 0)), *further], axis=2)
+        found = integrate_turn(turn.time, turn.rate, bias=bias, matrix=matrix, further=(np.zeros_like(force), stacked))
+        carried = between_middles(hand.poses, turn, found.mat_ji) @ hand.state.up[i]
+        by_psi = across[j].T @ skew(carried) / found.duration
+        row = np.zeros((2, space.size + 1))
+        row[:, 12:21] = by_psi @ found.by_matrix.reshape(3, 9)
+        place = 0
+        for effect in moving:
+            row[:, space.parts[effect.name]] = by_psi @ found.by_further[:, place:place + effect.size]
+            place += effect.size
+        row[:, -1] = -across[j].T @ carried / found.duration
+        rows.append(row)
+        durations.append(found.duration)
+        known.append(np.full(2, turn.noise_variance / found.duration**2))
+    return Block('turns', 'gyroscope', np.array(rows), np.array(known), np.array(known), np.array([turn.first for turn in turns]),
+                 np.array([turn.time.mean() for turn in turns]), np.array(durations))

@@ -1,0 +1,251 @@
+"""The equations of a calibration by hand: poses at rest, turns between them, and full turns of known angle."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.kinematics.preintegration import integrate_turn, small_rotation
+from imu_calibration.kinematics.reference_motion import skew
+from imu_calibration.references.gravity.hand_parameters import GYRO_BIAS, GYRO_MATRIX, LOWER, HandModel, unpack
+
+COMPONENTS = ('pose', 'drift', 'turn')
+"""Scatter beyond the noise: of the accelerometer between poses, of the gyroscope's bias, of the turns."""
+
+
+NEAR = 1e-3
+"""rad; its square, times a turn's few radians, is the error of the first-order correction."""
+CALM = 0.05
+"""Least scatter of the drifts in units of the noise of the means, so that no row has infinite weight."""
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Means over the intervals at rest."""
+
+    force: np.ndarray
+    """Mean accelerometer reading, m/s^2, shape (k, 3)."""
+    rate: np.ndarray
+    """Mean gyroscope reading, rad/s, shape (k, 3)."""
+    force_sem: np.ndarray
+    """Sd of `force` from the scatter within the intervals, shape (k, 3)."""
+    rate_sem: np.ndarray
+    """Sd of `rate` from the scatter within the intervals, shape (k, 3)."""
+    start: np.ndarray
+    """Index of the first sample, shape (k,)."""
+    stop: np.ndarray
+    """Index after the last sample, shape (k,)."""
+    time: np.ndarray
+    """Middle of each interval, seconds since the first sample, shape (k,)."""
+    temperature_c: np.ndarray | None = None
+    """Mean temperature, shape (k,), when it was recorded."""
+    noise: dict[str, NoiseModel] = field(default_factory=dict)
+    """Sensor -> noise within the intervals."""
+    period: float = 0.0
+    """Time from sample to sample, s."""
+    half_turn: np.ndarray | None = None
+    """Angle by which the attitude creeps across gravity from the middle of each interval to its end, rad, shape (k, 3); not in `rate`."""
+
+
+@dataclass(frozen=True, eq=False)
+class TurnData:
+    """Samples of a stretch of motion."""
+
+    time: np.ndarray
+    """Seconds, shape (n,)."""
+    rate: np.ndarray
+    """Measured rate, rad/s, shape (n, 3)."""
+    force: np.ndarray
+    """Measured specific force, m/s^2, shape (n, 3)."""
+    first: int = -1
+    """Pose before the turn."""
+    last: int = -1
+    """Pose after the turn."""
+    noise_variance: float = 0.0
+    """Variance of the integrated rate noise per axis, rad^2."""
+    rotation: np.ndarray | None = None
+    """Known rotation vector about a body axis, rad, shape (3,); None when gravity is the reference."""
+    rotation_cov: np.ndarray | None = None
+    """Covariance of `rotation`, shape (3, 3)."""
+    temperature_c: np.ndarray | None = None
+    """Temperature, shape (n,), when it was recorded."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Estimated quantities."""
+
+    values: np.ndarray
+    """Parameters in the order of the `HandModel`, shape (n,)."""
+    up: np.ndarray
+    """True direction of the specific force in each pose, unit vectors, shape (k, 3)."""
+    drift: np.ndarray
+    """Departure of the gyroscope's bias in each pose, rad/s, shape (k, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """Linearised equations ``residual = nuisance @ dn + main @ dp + error``, error of variance `noise` + `component`'s."""
+
+    residual: np.ndarray
+    """Measured minus predicted, shape (m,)."""
+    nuisance: np.ndarray
+    """Columns of directions (2 per pose) and drifts (3 per pose), shape (m, 5k)."""
+    main: np.ndarray
+    """Columns of the parameters, shape (m, n)."""
+    noise: np.ndarray
+    """Known variance of each row, shape (m,)."""
+    component: np.ndarray
+    """Index into `COMPONENTS`, or -1, shape (m,)."""
+
+
+def tangent(up: np.ndarray) -> np.ndarray:
+    """Return two unit vectors orthogonal to each row of `up`, shape (k, 3, 2)."""
+    helper = np.eye(3)[np.argmin(np.abs(up), axis=1)]
+    one = np.cross(up, helper)
+    one /= np.linalg.norm(one, axis=1, keepdims=True)
+    return np.stack([one, np.cross(up, one)], axis=2)
+
+
+def moved(state: State, step: np.ndarray, n_poses: int) -> State:
+    """Return the state after a step (nuisance, then parameters)."""
+    turn = np.einsum('kij,kj->ki', tangent(state.up), step[:2 * n_poses].reshape(-1, 2))
+    up = state.up + turn
+    return State(state.values + step[5 * n_poses:], up / np.linalg.norm(up, axis=1, keepdims=True),
+                 state.drift + step[2 * n_poses:5 * n_poses].reshape(-1, 3))
+
+
+def build_system(model: HandModel, state: State, poses: Poses, *, turns: Sequence[TurnData], memory: dict | None = None) -> System:
+    """
+    Stack the rows of poses, bias drifts and turns at the current state.
+
+    Parameters
+    ----------
+    model : HandModel
+    state : State
+    poses : Poses
+    turns : list of TurnData
+    memory : dict, optional
+        Turns integrated before; for similar parameters they are corrected to first order instead of being integrated again.
+
+    """
+    memory = {} if memory is None else memory
+    across = tangent(state.up)
+    rows = [_pose_rows(model, state, poses, across), _drift_rows(model, state, poses), _calm_rows(model, state, poses)]
+    for key, turn in enumerate(turns):
+        rows.append(_gravity_turn_rows(model, state, turn, key, memory, across, poses) if turn.rotation is None
+                    else _known_turn_rows(model, state, turn))
+    return System(*(np.concatenate(parts) for parts in zip(*rows)))
+
+
+def _pose_rows(model, state, poses, across):
+    """``force = bias + matrix @ (gravity * up) + further effects``: three rows per pose, two of them used for its direction."""
+    bias, matrix, *_ = unpack(state.values)
+    count = len(state.up)
+    true = model.gravity * state.up
+    more, slopes = model.further('accelerometer', state.values, true, rate=np.zeros_like(true), time=poses.time,
+                                 temperature_c=poses.temperature_c)
+    main = np.zeros((count, 3, model.size))
+    main[:, :, 0:3] = np.eye(3)
+    for column, (i, j) in enumerate(LOWER):
+        main[:, i, 3 + column] = true[:, j]
+    main[:, :, model.extra_index('accelerometer')] = slopes
+    nuisance = np.zeros((count, 3, 5 * count))
+    blocks = model.gravity * matrix @ across
+    for k in range(count):
+        nuisance[k, :, 2 * k:2 * k + 2] = blocks[k]
+    return _flat(poses.force - bias - true @ matrix.T - more, nuisance, main, poses.force_sem**2, 0)
+
+
+def _drift_rows(model, state, poses):
+    """``rate = bias + further effects (gravity * up) + drift`` at rest."""
+    count = len(state.up)
+    true = model.gravity * state.up
+    more, slopes = model.further('gyroscope', state.values, true, rate=np.zeros_like(true), time=poses.time,
+                                 temperature_c=poses.temperature_c)
+    main = np.zeros((count, 3, model.size))
+    main[:, :, GYRO_BIAS] = np.eye(3)
+    main[:, :, model.extra_index('gyroscope')] = slopes
+    return _flat(poses.rate - state.values[GYRO_BIAS] - more - state.drift, _drift_columns(count), main, poses.rate_sem**2, -1)
+
+
+def _calm_rows(model, state, poses):
+    """``0 = drift`` within the scatter of the drifts."""
+    count = len(state.up)
+    return _flat(-state.drift, _drift_columns(count), np.zeros((count, 3, model.size)), (CALM * poses.rate_sem)**2, 1)
+
+
+def _drift_columns(count):
+    nuisance = np.zeros((count, 3, 5 * count))
+    for k in range(count):
+        nuisance[k, :, 2 * count + 3 * k:2 * count + 3 * k + 3] = np.eye(3)
+    return nuisance
+
+
+def _integrated(model, state, data, bias, key, memory):
+    """Return (mat_ji, Turn), from memory when the gyroscope's parameters have hardly changed since."""
+    matrix, further = unpack(state.values)[3], state.values[model.extra_index('gyroscope')]
+    if key in memory:
+        (old_bias, old_matrix, old_further), turn = memory[key]
+        psi = (turn.by_bias @ (bias - old_bias) + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel()
+               + turn.by_further @ (further - old_further))
+        if np.linalg.norm(psi) < NEAR:
+            return small_rotation(-psi) @ turn.mat_ji, turn
+    turn = integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=_further_of_turn(model, state, data, bias))
+    memory[key] = ((bias, matrix, further), turn)
+    return turn.mat_ji, turn
+
+
+def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndarray:
+    """Return the matrix of a turn, (3, 3), from the middle of the pose before it to that of the one after."""
+    if poses.half_turn is None:
+        return mat_ji
+    return small_rotation(-poses.half_turn[turn.last]) @ mat_ji @ small_rotation(-poses.half_turn[turn.first])
+
+
+def _gravity_turn_rows(model, state, data, key, memory, across, poses):
+    """The direction before the turn, rotated by the gyroscope, against the direction after it: two rows, from middle to middle."""
+    count, i, j = len(state.up), data.first, data.last
+    mat_ji, turn = _integrated(model, state, data, state.values[GYRO_BIAS] + 0.5 * (state.drift[i] + state.drift[j]), key, memory)
+    mat_ji = between_middles(poses, data, mat_ji)
+    carried = mat_ji @ state.up[i]
+    across_i, across_j = across[i], across[j]
+    by_psi = across_j.T @ skew(carried)
+    main, nuisance = np.zeros((2, model.size)), np.zeros((2, 5 * count))
+    main[:, GYRO_BIAS] = by_psi @ turn.by_bias
+    main[:, GYRO_MATRIX] = by_psi @ turn.by_matrix.reshape(3, 9)
+    main[:, model.extra_index('gyroscope')] = by_psi @ turn.by_further
+    nuisance[:, 2 * i:2 * i + 2] += across_j.T @ mat_ji @ across_i
+    nuisance[:, 2 * j:2 * j + 2] -= (carried @ state.up[j]) * np.eye(2)
+    for pose in (i, j):
+        nuisance[:, 2 * count + 3 * pose:2 * count + 3 * pose + 3] += 0.5 * main[:, GYRO_BIAS]
+    return -across_j.T @ carried, nuisance, main, np.full(2, data.noise_variance), np.full(2, 2)
+
+
+def _known_turn_rows(model, state, data):
+    """``matrix^-1 integral(measured - bias - further effects) = rotation`` for a turn about a fixed body axis, whitened: three rows."""
+    _, _, bias, matrix = unpack(state.values)
+    further = _further_of_turn(model, state, data, bias)
+    turn = integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=further)
+    inverse = np.linalg.inv(matrix)
+    rotation = inverse @ turn.integral
+    main = np.zeros((3, model.size))
+    main[:, GYRO_BIAS] = -turn.duration * inverse
+    main[:, GYRO_MATRIX] = -np.einsum('rp,q->rpq', inverse, rotation).reshape(3, 9)
+    impulse = np.einsum('m,mip->ip', np.diff(data.time), 0.5 * (further[1][:-1] + further[1][1:]))
+    main[:, model.extra_index('gyroscope')] = -inverse @ impulse
+    white = np.linalg.inv(np.linalg.cholesky(data.rotation_cov + data.noise_variance * np.eye(3)))
+    return (white @ (data.rotation - rotation), np.zeros((3, 5 * len(state.up))), white @ main, np.ones(3), np.full(3, -1))
+
+
+def _further_of_turn(model, state, data, bias):
+    """Return output and columns of the gyroscope's further effects along a turn, at the forces and rates without them."""
+    bias_f, matrix_f, _, matrix = unpack(state.values)
+    force, rate = np.linalg.solve(matrix_f, (data.force - bias_f).T).T, np.linalg.solve(matrix, (data.rate - bias).T).T
+    return model.further('gyroscope', state.values, force, rate=rate, time=data.time, temperature_c=data.temperature_c)
+
+
+def _flat(residual, nuisance, main, noise, component):
+    return (residual.ravel(), nuisance.reshape(-1, nuisance.shape[-1]), main.reshape(-1, main.shape[-1]), noise.ravel(),
+            np.full(residual.size, component))

@@ -1,0 +1,321 @@
+"""Calibration without a table: gravity is the reference, poses held still and the turns between them are the data."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from imu_calibration.core.errors import InputError, NotObservableError
+from imu_calibration.core.progress import report
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
+from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, Terms, replace_weak, sd_without, total, with_term
+from imu_calibration.estimation.model_error import ModelError
+from imu_calibration.estimation.status import FIXED, HELD, statuses
+from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.references.gravity.bias_movement import bias_movements, with_movement, without_movement
+from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State
+from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
+from imu_calibration.references.gravity.hand_options import ByHandSettings, HandOptions, KnownTurn
+from imu_calibration.references.gravity.hand_parameters import BASE_NAMES, CROSS_TERMS, UPPER, HandModel, unpack
+from imu_calibration.references.gravity.pose_outliers import possible_turns, without_outliers
+from imu_calibration.references.gravity.pose_solver import first_state, solve_joint
+from imu_calibration.references.gravity.poses import average_poses, distinct_attitudes, noise_statistics
+from imu_calibration.references.gravity.turns import collect_turns, known_turn_data, sample_times
+from imu_calibration.references.gravity.turns_within_range import full_scale_factor
+from imu_calibration.selection.linearisation import at_time_constants
+
+GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
+"""x along the accelerometer's x input axis, y in the plane of its x and y input axes."""
+PUBLISHED = tuple(SensorModel().param_names)
+"""Order of the parameters in the result; further effects follow."""
+POSES_LEAST = 4
+"""With fewer attitudes even the accelerometer's biases are determined by the prior."""
+SIGNIFICANT = 1.96**2
+"""Likelihood ratio above which the data contradict a cross term of zero: 95 % of chi-square with one degree of freedom."""
+PASSES = 4
+"""Largest number of solutions, when the columns of a warm-up are recomputed or poses and turns are excluded."""
+SETTLED = 0.03
+"""Relative change of a time constant below which its columns are not recomputed."""
+POSES_FULL = 12
+"""The nine accelerometer parameters need one equation per attitude; further ones determine the scatter of the poses."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandCalibration:
+    """Forward model ``measured = bias + matrix @ true (+ g-sensitivity @ force)`` of both sensors, with its uncertainty."""
+
+    param_names: tuple
+    """SENSOR.EFFECT.COMPONENT; matrix components are row, column."""
+    values: np.ndarray
+    """Parameters in `param_names` order, SI, shape (n,)."""
+    terms: Terms
+    """Covariance of `values` as named terms (`covariance_terms`), each of shape (n, n)."""
+    statuses: tuple
+    """'determined', 'weak' or 'held' for each parameter."""
+    tolerances: np.ndarray
+    """Sufficient standard deviation, shape (n,)."""
+    priors: np.ndarray
+    """Sd before any data, shape (n,)."""
+    gravity: float
+    """Reference, m/s^2."""
+    gauge: dict
+    """Conventions of origin and axes."""
+    statistics: dict
+    """Counts, noise, scatter, chi-square: plain numbers."""
+    poses: Poses
+    """The poses that were used."""
+    state: State
+    """Directions and drifts of the poses, and the parameters in the order of `model`."""
+    model: HandModel
+    """Estimated parameters."""
+    information: np.ndarray
+    """Information of the data without priors, in the order of `model`, shape (m, m)."""
+    used_poses: Poses
+    """The poses as weighted: excluded ones with negligible weight, a drifting bias at its mean."""
+    used_turns: list
+    """`TurnData` without excluded turns."""
+    model_error: ModelError
+    """Increase of the covariance beyond noise and scatter, in the order of `model`."""
+    replaced: tuple[str, ...] = ()
+    """Weak parameters that were replaced by their prior."""
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """Covariance of `values`, the sum of its terms, shape (n, n)."""
+        return total(self.terms)
+
+    @property
+    def sd(self) -> np.ndarray:
+        """Standard deviation of each parameter, shape (n,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def own_sd(self) -> np.ndarray:
+        """Standard deviation of each parameter relative to gravity as used, without its uncertainty (`common_scale`), shape (n,)."""
+        return sd_without(self.terms, GRAVITY)
+
+    def value(self, name: str) -> float:
+        """Return the parameter called `name`."""
+        return float(self.values[self.param_names.index(name)])
+
+    def sd_of(self, name: str) -> float:
+        """Return the standard deviation of the parameter called `name`."""
+        return float(self.sd[self.param_names.index(name)])
+
+    @property
+    def accelerometer(self) -> tuple[np.ndarray, np.ndarray]:
+        """(bias, matrix) of the accelerometer."""
+        return unpack(self.state.values)[:2]
+
+    @property
+    def gyroscope(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity."""
+        effect = self.model.model.find('gyroscope', Role.CROSS)
+        response = np.zeros((3, 3)) if effect is None else self.state.values[self.model.parts[effect.key]].reshape(3, 3)
+        return *unpack(self.state.values)[2:], response
+
+    def compensate(self, force: np.ndarray, rate: np.ndarray, time: np.ndarray | None = None, *,
+                   temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return true specific force and rate for readings of shape (n, 3), at `time` s and `temperature_c` for effects that need them."""
+        return self.model.compensate(self.state.values, force, rate, time=time, temperature_c=temperature_c)
+
+    def norm_residuals(self, force: np.ndarray | None = None) -> np.ndarray:
+        """Return ``|compensated force| - gravity`` of the poses, or of other mean readings at rest, shape (k,)."""
+        if force is None:
+            poses = self.poses
+            return self.model.norm_rows(self.state.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0]
+        return self.model.norm_rows(self.state.values, force)[0]
+
+
+def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), stills: Sequence | None = None, *,
+                      known_turns: Sequence[KnownTurn] = (), temperature_c: np.ndarray | None = None) -> HandCalibration:
+    """
+    Calibrate accelerometer and gyroscope from poses held still and the turns between them.
+
+    One weighted least-squares system: ``force_k = bias + matrix @ gravity u_k`` in pose k, ``C u_i = u_j`` for the turn from
+    pose i to j with C integrated from the rates, ``rate_k = bias + drift_k`` at rest. Scatter beyond the noise of poses,
+    drifts and turns is estimated as well. A wrong gravity is equivalent to a common scale of the accelerometer.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        Stamps must not go backwards.
+    options : HandOptions
+        Reference, effects, tolerances.
+    stills : sequence of slices or (start, stop), optional
+        Intervals at rest; found by `static_detector.find_still` when not given.
+    known_turns : sequence of KnownTurn
+        Full turns by hand, in addition to gravity as reference.
+    temperature_c : array, optional
+        Temperature at the samples, degrees Celsius, shape (n,).
+
+    Returns
+    -------
+    HandCalibration
+
+    Raises
+    ------
+    NotObservableError
+        With fewer than four different attitudes.
+
+    """
+    data = gather_by_hand(imu, stills, options.settings, known_turns=known_turns, temperature_c=temperature_c)
+    return solve_by_hand(data, options)
+
+
+@dataclass(frozen=True, eq=False)
+class HandData:
+    """Poses and turns of a recording without a table."""
+
+    poses: Poses
+    """Means over the intervals at rest."""
+    turns: list
+    """`TurnData` between consecutive poses, then those of known angle."""
+    statistics: dict
+    """Attitudes, excluded turns, noise and period of the samples."""
+
+
+def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, settings: ByHandSettings = ByHandSettings(), *,
+                   known_turns: Sequence[KnownTurn] = (), temperature_c: np.ndarray | None = None) -> HandData:
+    """Return the `HandData` of samples; arguments and errors as in `calibrate_by_hand`."""
+    time = sample_times(imu)
+    poses = average_poses(imu, _as_ranges(imu, stills), temperature_c)
+    attitudes = distinct_attitudes(poses.force, settings.pose_apart)
+    if attitudes < POSES_LEAST:
+        raise NotObservableError(
+            f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all parameters), '
+            f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes, '
+            'or describe the table or arm that moved it', key='table', code='too_few_attitudes')
+    turns, dropped = collect_turns(time, imu, poses=poses, settings=settings, temperature_c=temperature_c)
+    turns += [known_turn_data(time, imu, turn, poses=poses, settings=settings, temperature_c=temperature_c) for turn in known_turns]
+    return HandData(poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)})
+
+
+def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = None) -> HandCalibration:
+    """
+    Estimate from given poses and turns.
+
+    See `calibrate_by_hand`. `point`: effect -> values at which its columns are first computed.
+    """
+    report('solving')
+    poses, turns, settings = data.poses, data.turns, options.settings
+    fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
+    default, evidence = default_gyroscope(poses, settings)
+    reference_c = 25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
+    sensors = SensorModel(options.accelerometer or BASE, options.gyroscope or default, temperature_ref_c=reference_c, point=point or {},
+                          catalogue=options.catalogue)
+    model = HandModel(sensors, options.gravity)
+    _check_temperature(model, poses)
+    state = first_state(model, poses)
+    model = replace(model, gyro_factor=full_scale_factor(state, poses, turns))
+    turns, contradicted = possible_turns(model, state, poses, turns=turns)
+    left = {'contradicted by gravity': contradicted} if contradicted else {}
+    solved = partial(solve_joint, gravity_sd=options.gravity_sd, fallback=fallback)
+    for effect in model.extras:
+        if effect.time_constant and effect.name not in (point or {}):   # a time constant far from the prior does not converge from there
+            trials = [replace(model, model=each) for each in at_time_constants(model.model, effect, float(poses.time[-1]))]
+            scatter = [solved(trial, poses, turns).scatter.variance[SENSORS.index(effect.sensor)] for trial in trials]
+            model = trials[int(np.argmin(scatter))]
+    for _ in range(PASSES):
+        found = solved(model, poses, turns)
+        settled, model = _settled(model, found), model.at(found.state.values)
+        poses, turns, out = without_outliers(model, found, poses=poses, turns=turns)
+        left |= {f'outlying {kind}': left.get(f'outlying {kind}', 0) + count for kind, count in out.items()}
+        if settled and not out:
+            break
+    movements = bias_movements(model, found.state.values, poses)
+    if 'accelerometer' in movements:
+        poses = without_movement(poses, movements)
+        found = solved(model, poses, turns)
+    terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
+    used, poses = poses, data.poses   # the result has all poses unchanged, also excluded and drifting ones
+    goals = model.tolerances(options.tolerances)
+    status = statuses(sd_without(terms, GRAVITY), found.held, goals)
+    statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
+                  'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()},
+                  **_statistics(model, found, poses, turns)}
+    if options.gravity_sd:
+        sd, goal = options.gravity_sd / options.gravity, float(goals[3])
+        statistics['common_scale'] = {'sd': sd, 'tolerance': goal, 'status': str(statuses([sd], [False], [goal])[0])}
+    names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
+    index = np.array([model.param_names.index(name) if name not in UPPER else -1 for name in names])
+    padded = {name: np.pad(term, (0, 1))[np.ix_(index, index)] for name, term in terms.items()}  # index -1: zero by convention, certain
+    return HandCalibration(names, np.append(found.state.values, 0.0)[index], padded,
+                           tuple((*status, FIXED)[k] for k in index), np.append(goals, goals[3])[index],
+                           np.append(model.priors, 0.0)[index], options.gravity, dict(GAUGE), statistics, poses, found.state, model,
+                           found.factor.T @ found.factor, used, turns, found.model_error)
+
+
+def with_weak_replaced(hand: HandCalibration) -> HandCalibration:
+    """
+    Return the calibration with weak values replaced by their prior (`replace_weak`).
+
+    Cross terms of the accelerometer are replaced if zero is not significantly worse by the likelihood ratio, because near the six faces
+    the poses determine them only through small tilts; other parameters where that lowers the expected error.
+    """
+    held = np.array([status == HELD for status in hand.statuses])
+    nominal = dict.fromkeys(UPPER, 0.0) | dict(zip(hand.model.param_names, hand.model.nominal))
+    applied = {name for effect in hand.model.model.effects if effect.compensation == 'exact' for name in effect.param_names()}
+    weak = np.flatnonzero(~held & (hand.own_sd > hand.tolerances) & np.isin(hand.param_names, list(applied)))
+    values, terms, replaced = replace_weak(hand.values, hand.terms, np.array([nominal[name] for name in hand.param_names]),
+                                           weak=weak.tolist(), limit=np.where(np.isin(hand.param_names, CROSS_TERMS), SIGNIFICANT, 1.0))
+    known = dict(zip(hand.param_names, values))
+    state = replace(hand.state, values=np.array([known[name] for name in hand.model.param_names]))
+    return replace(hand, values=values, terms=terms, state=state, replaced=tuple(np.array(hand.param_names)[replaced].tolist()),
+                   statuses=statuses(sd_without(terms, GRAVITY), held | replaced, hand.tolerances))
+
+
+def _settled(model, found):
+    """Return whether the columns of warm-ups were computed close enough to the solution."""
+    for effect in model.extras:
+        part = model.parts[effect.key]
+        if effect.time_constant and not found.held[part][-1]:
+            known = model.model.point_of(effect)[-1]
+            if abs(found.state.values[part][-1] / known - 1) > SETTLED:
+                return False
+    return True
+
+
+def _check_temperature(model, poses):
+    thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
+    if thermal and poses.temperature_c is None:
+        raise InputError(f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or omit it')
+
+
+def default_gyroscope(poses: Poses, settings: ByHandSettings) -> tuple[tuple[str, ...], dict]:
+    """Return (the gyroscope's effects without a request, the evidence of the poses for g-sensitivity)."""
+    if settings.g_sensitivity not in ('auto', 'on', 'off'):
+        raise InputError(f"setting 'g_sensitivity' must be auto, on or off, got {settings.g_sensitivity!r}; choose one of them",
+                         code='choice_unknown')
+    evidence = g_sensitivity_evidence(poses)
+    wanted = settings.g_sensitivity == 'on' or (settings.g_sensitivity == 'auto' and shown(evidence))
+    return G_SENSITIVE if wanted else BASE, evidence
+
+
+def _statistics(model, found, poses, turns):
+    before, after = (model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0]
+                     for values in (model.nominal, found.state.values))
+    sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
+    spare = len(after) - int(np.sum(~found.held[model.index_of('accelerometer')]))
+    result = {'poses': len(poses.start), 'turns': len(turns), 'steps': found.steps,
+              'norm_residual_rms_before': float(np.sqrt(np.mean(before**2))), 'norm_residual_rms': float(np.sqrt(np.mean(after**2))),
+              'norm_chi2_per_dof': float(np.sum((after / sem)**2) / spare) if spare > 0 else None}
+    for index, name in enumerate(COMPONENTS):
+        result[f'{name}_scatter_sd'] = float(np.sqrt(found.scatter.variance[index]))
+        result[f'{name}_dof'] = float(found.scatter.dof[index])
+    return result
+
+
+def _as_ranges(imu, stills):
+    if stills is None:
+        stills = find_still(imu)
+    ranges = [(s.start, s.stop) if isinstance(s, slice) else (int(s[0]), int(s[1])) for s in stills]
+    ranges = [(a, b) for a, b in ranges if b - a >= 2]
+    if not ranges:
+        raise NotObservableError(f'calibration by hand needs at least {POSES_LEAST} different attitudes held still, '
+                                 'got no interval at rest; hold the IMU still for a second or more in each attitude, '
+                                 'or describe the table or arm that moved it', key='table', code='no_rest')
+    return ranges

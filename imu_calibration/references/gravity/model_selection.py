@@ -1,0 +1,291 @@
+"""Test of every effect on a recording by hand: the search of a diagnosis, on poses and turns instead of windows on a table."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from imu_calibration.core.errors import NotObservableError
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.sensor_model import BASE
+from imu_calibration.references.gravity.effect_rows import Block, HandSpace, build_rows
+from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
+from imu_calibration.references.gravity.hand_calibration import HandCalibration, HandData, solve_by_hand
+from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import possible_by_hand
+from imu_calibration.references.gravity.pose_evidence import HandEvidence
+from imu_calibration.selection.evidence import agree
+from imu_calibration.selection.explained_share import SIGNIFICANT_REST, pruned
+from imu_calibration.selection.gain import Gain, reduction_interval
+from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
+from imu_calibration.selection.search import Named, Search
+
+OUTER = 12
+"""Number of repetitions of the search without some of the poses, to measure the gain on them."""
+SPARE = 3
+"""Least number of poses beyond the nine parameters of the accelerometer."""
+POSES_LEAST = 9 + SPARE
+"""With fewer poses none can be held out."""
+
+
+class Inquiry:
+    """Rows of a recording, the evidence on a subset of its poses, and the search."""
+
+    def __init__(self, blocks: Sequence[Block], space: HandSpace, questions: Sequence[Question], *, baseline: Sequence[int]):
+        smooth = [k for q in questions if q.effect.smooth and not q.effect.time_constant for k in q.parameters]
+        self.blocks, self.space, self.questions = blocks, space, questions
+        self.evidence = HandEvidence(blocks, space, smooth, baseline=baseline)
+        self.search = Search(self.evidence, baseline, questions)
+
+    def without(self, poses: np.ndarray) -> 'Inquiry':
+        """Return the same inquiry without some poses."""
+        return Inquiry(self._blocks_without(poses), self.space, self.questions, baseline=self.search.baseline)
+
+    def _blocks_without(self, poses):
+        blocks = [block.select(~np.isin(block.pose, poses)) for block in self.blocks]
+        return [block for block in blocks if block.known.size > 3]
+
+    def named(self) -> list[Question]:
+        """
+        Return the findings: chosen effects of which each explains most of the excess variance.
+
+        Sizes beyond the range of known instruments are tested only for the remaining excess.
+        """
+        named = list(pruned(self.search.run(), self.share))
+        if self.rest(named):
+            wide = Search(self.evidence, self.search.baseline, self.questions, any_size=True)
+            known, self.search = self.search, wide
+            others = list(pruned(wide.run(), self.share))
+            if self.rest(others) < self.rest(named):
+                return others
+            self.search = known
+        return named
+
+    def rest(self, chosen: Sequence[Question], sensor: str | None = None) -> float:
+        """Return the significant excess over noise of a choice in held-out poses, of one sensor or of both."""
+        left = self.evidence.heldout_residuals(self.search.used(chosen))
+        excess = [(np.sum(new**2 / block.floor) - new.size, new.size)
+                  for block, new in zip(self.blocks, left) if sensor in (None, block.sensor)]
+        return sum(value for value, size in excess if value > SIGNIFICANT_REST * np.sqrt(2 * size))
+
+    def share(self, chosen: Sequence[Question], question: Question) -> float:
+        """Return the share of the excess over noise in held-out poses that the effect removes from its sensor."""
+        after, before = (self.evidence.heldout_residuals(self.search.used(c)) for c in (chosen, [q for q in chosen if q is not question]))
+        removed = sum(np.sum((old**2 - new**2) / block.floor)
+                      for block, new, old in zip(self.blocks, after, before) if block.sensor == question.sensor)
+        return removed / (removed + self.rest(chosen, question.sensor)) if removed > 0 else 0.0
+
+    def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
+        """
+        Return whether the estimates of an effect from the poses before and after the middle agree (`halves.agree`).
+
+        Effects that are smooth in time differ by nature.
+        """
+        if question.effect.smooth:
+            return True
+        used = self.search.used(chosen)
+        poses = np.unique(np.concatenate([block.pose for block in self.blocks]))
+        # the chosen effects are no noise here, so they are part of the baseline
+        first, second, whole = (HandEvidence(self._blocks_without(out), self.space, (), baseline=used).fit(used)
+                                for out in (*np.array_split(poses, 2), ()))
+        return agree((first, second), whole, [used.index(k) for k in question.parameters])
+
+
+@dataclass(frozen=True, eq=False)
+class HandInvestigation(Named):
+    """Result of a search, before its report."""
+
+    baseline: HandCalibration
+    """The calibration under diagnosis."""
+    inquiry: Inquiry
+    """Rows, evidence and search."""
+    named: Sequence[Question]
+    """Questions that became findings, in the order found."""
+    held_out: Sequence
+    """(poses, findings without them, the inquiry without them), ...: the complete search, repeated."""
+    not_testable: list[dict]
+    """Effects that could not be tested."""
+    constants: np.ndarray
+    """Time constants of the warm-ups under test, s."""
+    denied: Sequence[Question] = field(default_factory=list)
+    """Effects that were rejected because the estimates of the two halves differ significantly."""
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """Sensor -> effects for the model."""
+        return {sensor: tuple(q.name for q in self.adopted if q.sensor == sensor) for sensor in SENSORS}
+
+    @property
+    def search(self) -> Search:
+        """Search of the findings."""
+        return self.inquiry.search
+
+    def point(self) -> dict[str, np.ndarray]:
+        """Return effect -> initial values for its columns, of the warm-ups among the findings."""
+        used = self.inquiry.search.used(self.named)
+        values, point = self.inquiry.evidence.fit(used)[0], {}
+        for question in self.named:
+            if '@' in question.label:
+                amplitude = [values[used.index(k)] for k in question.parameters]
+                point[question.name] = np.array([*amplitude, self.constants[int(question.label.split('@')[1])]])
+        return point
+
+    def moved_by(self, question: Question) -> dict[str, float]:
+        """Return baseline parameter -> its change when an effect is added to the findings."""
+        search, evidence = self.inquiry.search, self.inquiry.evidence
+        others = [q for q in self.named if q is not question]
+        smaller, larger = search.used(others), search.used([*others, question])
+        moved = evidence.fit(larger)[0][:len(smaller)] - evidence.fit(smaller)[0]
+        names = self.baseline.model.param_names
+        return {names[k]: float(change) for k, change in zip(smaller, moved) if k < len(names)}
+
+    def gain(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Gain:
+        """Return the Gain of one choice over another on poses held out from both fit and choice."""
+        return _gain(self.inquiry, self.held_out, before, after, sensor)
+
+
+def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), progress: Callable | None = None) -> HandInvestigation:
+    """
+    Test every effect that is observable by hand on held-out poses.
+
+    Every pose is held out in turn. The accelerometer is tested with the norm of gravity, the gyroscope with the rates at rest and the
+    directions of gravity before and after each turn. Poses are few, so variances are estimated too (F tests, losses
+    ``n log(mean square)``), with a bias process in addition to the scatter between poses.
+
+    Parameters
+    ----------
+    data : HandData
+        From `gather_by_hand`.
+    options : HandOptions
+        Reference, tolerances, and the effects of the baseline: by default bias and matrix.
+    progress : callable, optional
+        Called with the completed share.
+
+    Raises
+    ------
+    NotObservableError
+        With too few poses to hold any out.
+
+    """
+    report, poses = progress or (lambda share: None), data.poses
+    if len(poses.start) < POSES_LEAST:
+        raise too_few_poses(len(poses.start))
+    baseline = solve_by_hand(data, replace(options, accelerometer=options.accelerometer or BASE, gyroscope=options.gyroscope or BASE))
+    follows_gravity = shown(g_sensitivity_evidence(poses))
+    effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity))
+    constants = time_constants(float(poses.time[-1]))
+    blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
+    report(0.1)
+    base = tuple(range(baseline.model.size + 1))   # including fixed parameters and the Earth's rate: their uncertainty is no finding
+    questions = _questions(effects, blocks, space, base, not_testable)
+    inquiry = Inquiry(blocks, space, questions, baseline=base)
+    named = inquiry.named()
+    report(0.3)
+    held_out = _held_out(inquiry, report) if named else []
+    named = _that_predict(inquiry, held_out, named)
+    denied = [question for question in named if not inquiry.agrees_in_halves(named, question)]
+    if denied:
+        named = _that_predict(inquiry, held_out, [question for question in named if question not in denied])
+    return HandInvestigation(baseline, inquiry, named, held_out, not_testable, constants, denied)
+
+
+def too_few_poses(count: int) -> NotObservableError:
+    """Return the error of a recording with so few poses that none can be held out."""
+    return NotObservableError(f'a diagnosis by hand needs at least {POSES_LEAST} poses held still, so that some can be held out, '
+                              f'{count} were found; hold the IMU still in more attitudes',
+                              code='too_few_poses')
+
+
+def _that_predict(inquiry, held_out, named):
+    """Return the findings that improve the prediction of poses held out from their choice."""
+    named = list(named)
+    while named:
+        gains = [_gain(inquiry, held_out, named[:k], named[:k + 1], q.sensor) for k, q in enumerate(named)]
+        poor = [q for q, gain in zip(named, gains) if not gain.ci95[0] > 0]
+        if not poor:
+            break
+        named.remove(poor[-1])
+    return named
+
+
+def _why_not(effect, poses, turns, follows_gravity):
+    if effect.role is Role.LIMIT:
+        return 'the true values of clipped samples are unknown; turns that reach a limit are excluded', 'record on a table'
+    if 'cooling' in effect.needs:
+        return 'the thermal branch is not tracked between poses', 'record on a table'
+    if 'vibration' in effect.needs:
+        return 'poses by hand are at rest, so that the vibration does not vary', 'record on a table'
+    if not possible_by_hand(effect):
+        return 'gravity in poses and the turns between them do not show it', 'record on a table'
+    if 'temperature' in effect.needs and poses.temperature_c is None:
+        return 'no temperature was recorded', 'record imu/temperature'
+    if 'temperature' in effect.needs and np.ptp(poses.temperature_c) < TEMPERATURE_SPAN:
+        return (f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only',
+                'record while the sensor warms up by at least some kelvins')
+    if effect.role is Role.CROSS and not follows_gravity:   # the same test as in calibration
+        return ('rates at rest do not separate it from a bias that moves in time', 'hold each attitude again later, in a different order')
+    moving = effect.sensor == 'gyroscope' and any('rate' in group.uses for group in effect.groups)
+    if moving and len([t for t in turns if t.rotation is None]) < 6:
+        return 'there are fewer than six turns between poses', 'turn it by half a turn between poses'
+    return None
+
+
+def _questions(effects, blocks, space, base, not_testable):
+    """Return the questions; an effect that is collinear with the baseline in these poses is moved to `not_testable`."""
+    by_name, asked = {e.name: e for e in effects}, []
+    probe = HandEvidence(blocks, space, (), baseline=base)
+    for label in space.names:
+        part, name = space.parts[label], label.split('@')[0]
+        parameters = tuple(range(part.start, part.stop))
+        rank = probe.rank(parameters, base)
+        if rank:
+            asked.append(Question(by_name[name], parameters, rank + ('@' in label), label))
+    lacking = sorted(by_name.keys() - {q.name for q in asked})
+    not_testable += [{'effect': name, 'why': 'in these poses bias and matrix imitate it',
+                      'needs': 'more poses, in steps of 30 degrees about each axis'}
+                     for name in lacking]
+    return asked
+
+
+def _held_out(inquiry, report):
+    """Return fold -> (poses, findings without them, evidence without them): the complete search, repeated."""
+    poses = np.unique(np.concatenate([block.pose for block in inquiry.blocks]))
+    found, times = [], min(OUTER, len(poses))
+    for number in range(times):
+        out = poses[number::times]
+        smaller = inquiry.without(out)
+        found.append((out, smaller.named(), smaller))
+        report(0.3 + 0.6 * (number + 1) / times)
+    return found
+
+
+def _predicted(inquiry, held_out, allowed):
+    """Return residuals per block of poses held out from fit and choice; only effects called `allowed` are used."""
+    found = [np.full(block.known.shape, np.nan) for block in inquiry.blocks]
+    for out, named, smaller in held_out:
+        chosen = [q for q in named if q.name in allowed]
+        used = smaller.search.used(chosen)
+        values = smaller.evidence.fit(used)[0]
+        for residual, block in zip(found, inquiry.blocks):
+            rows = np.isin(block.pose, out)
+            residual[rows] = block.rows[rows, :, -1] - block.rows[rows][:, :, list(used)] @ values
+    return found
+
+
+def _gain(inquiry, held_out, before, after, sensor):
+    """Return the Gain of one choice over another on poses held out from both fit and choice."""
+    pair = [_predicted(inquiry, held_out, {q.name for q in choice}) for choice in (before, after)]
+    inside = [inquiry.evidence.heldout_residuals(inquiry.search.used(choice)) for choice in (before, after)]
+    best = None
+    for k, block in enumerate(inquiry.blocks):
+        if block.sensor != sensor:
+            continue
+        fall = np.sum(inside[1][k]**2) / max(np.sum(inside[0][k]**2), 1e-300)
+        if best is None or fall < best[0]:
+            best = (fall, k)
+    block = inquiry.blocks[best[1]]
+    poses = np.unique(block.pose)
+    sums = [(np.array([np.sum(p[best[1]][block.pose == pose]**2) for pose in poses]),
+             np.array([block.known[block.pose == pose].size for pose in poses], float)) for p in pair]
+    rms = [float(np.sqrt(squares.sum() / number.sum())) for squares, number in sums]
+    return Gain(sensor, block.name, rms[0], rms[1], reduction_interval(sums), len(poses))

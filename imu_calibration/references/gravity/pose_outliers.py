@@ -1,0 +1,102 @@
+"""Outlying poses and turns: a touch of the IMU, or a turn that the recorder missed."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imu_calibration.core.distributions import chance_of_fall
+from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State, TurnData, build_system
+from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.references.gravity.pose_solver import HandSolution
+from imu_calibration.references.gravity.turns_within_range import missed_angle
+
+P_VALUE = 1e-3
+"""False positive rate for a recording without outliers, per kind."""
+SHARE = 0.1
+"""Largest share of each kind that is excluded (one of few); a more frequent deviation is a property of the recording."""
+LEAST_SPARE = 3.0
+"""Degrees of freedom of the remaining data that the test requires."""
+CONTRADICTED = 0.35
+"""
+rad; a larger angle between rotated and observed gravity after a turn is no error of the rates: scale errors of a tenth cause less.
+"""
+SEEN = 0.05
+"""A combination of a unit's rows that keeps less than this share of its error after the fit is not tested."""
+LOOSE = 1e3
+"""Sd factor that excludes an outlying pose; its direction is still estimated from the turns."""
+
+
+def possible_turns(model: HandModel, state: State, poses: Poses, *, turns: Sequence[TurnData]) -> tuple[list[TurnData], int]:
+    """Return (turns whose rates match gravity approximately, number of excluded turns): in a pause of the recorder, rates miss a turn."""
+    kept = [turn for turn in turns if turn.rotation is not None
+            or missed_angle(state, poses, turn, matrix=model.gyro_factor * np.eye(3)) < CONTRADICTED]
+    return kept, len(turns) - len(kept)
+
+
+def without_outliers(model: HandModel, found: HandSolution, *, poses: Poses, turns: list[TurnData]) -> tuple[Poses, list[TurnData], dict]:
+    """
+    Return (poses, turns, {kind: number}) without outliers: leave-one-out F tests per kind, with Bonferroni correction.
+
+    Excluded poses keep their place, with negligible weight.
+    """
+    units = _units(poses, turns)
+    rest, leverage, component = _whitened(model, found, poses, turns)
+    left = {}
+    for kind in range(len(COMPONENTS)):
+        own = [(rows, index) for rows, index, group in units if group == kind]
+        total, spare = _distance(rest[component == kind], leverage[component == kind], 1e-3)
+        allowed = max(1, int(SHARE * len(own)))
+        worst = sorted((_p_value(rest[rows], leverage[rows], total, spare), index) for rows, index in own)
+        out = [index for p, index in worst[:allowed] if p * max(len(own), 1) < P_VALUE]
+        if out:
+            left[COMPONENTS[kind]] = out
+    if left.get('pose'):
+        poses = replace(poses, force_sem=_loosened(poses.force_sem, left['pose']))
+    if left.get('drift'):
+        poses = replace(poses, rate_sem=_loosened(poses.rate_sem, left['drift']))
+    turns = [turn for index, turn in enumerate(turns) if index not in left.get('turn', ())]
+    return poses, turns, {kind: len(out) for kind, out in left.items()}
+
+
+def _units(poses, turns):
+    """Return (rows, index of the pose or turn, component) in the order of `build_system`: poses, rates at rest, calm drifts, turns."""
+    count = len(poses.start)
+    units = [(slice(3 * k, 3 * k + 3), k, 0) for k in range(count)]
+    units += [(slice(6 * count + 3 * k, 6 * count + 3 * k + 3), k, 1) for k in range(count)]
+    start = 9 * count
+    for index, turn in enumerate(turns):
+        if turn.rotation is None:
+            units.append((slice(start, start + 2), index, 2))
+        start += 2 if turn.rotation is None else 3
+    return units
+
+
+def _whitened(model, found, poses, turns):
+    """Return residuals in sds, an orthonormal basis of the fitted columns, and the component of each row."""
+    system = build_system(model, found.state, poses, turns=turns)
+    root = np.sqrt(found.scatter.total(system.noise, system.component))
+    design = np.hstack([system.nuisance, system.main[:, ~found.held]]) / root[:, None]
+    rest = system.residual / root
+    basis = np.linalg.qr(np.vstack([design, np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)]))[0][:len(rest)]
+    return rest - basis @ (basis.T @ rest), basis, system.component
+
+
+def _distance(rest, basis, least):
+    """Return (squared Mahalanobis distance of some residuals, with the covariance of residuals after the fit, and its rank)."""
+    values, vectors = np.linalg.eigh(np.eye(len(rest)) - basis @ basis.T)
+    seen = values > least
+    return float(np.sum((vectors[:, seen].T @ rest)**2 / values[seen])), int(np.count_nonzero(seen))
+
+
+def _p_value(rest, basis, total, spare):
+    square, count = _distance(rest, basis, SEEN)
+    if not count or spare - count < LEAST_SPARE:
+        return 1.0
+    return chance_of_fall(square, count, rest=total - square, spare=spare - count)
+
+
+def _loosened(sem, index):
+    loose = sem.copy()
+    loose[index] *= LOOSE
+    return loose

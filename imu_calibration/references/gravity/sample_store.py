@@ -1,0 +1,149 @@
+"""The sample store of a live calibration by hand: all samples up to a limit, then the least informative are discarded first."""
+
+import io
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
+from imu_calibration.core.regular_files import load_arrays
+from imu_calibration.core.samples import ImuSamples
+
+FORMAT = 'imu_calibration/hand_samples/1'
+PAUSE_NS = 3600 * 10**9
+"""Pause that is inserted at a clock reset: no turn is used across it."""
+REST_KEPT = 30.0
+"""Of a rest that is discarded, this much is kept at its start and at its end, s."""
+HELD_OUT = 1.0
+"""Longest distance of two parts of one rest, s: the time excluded after a hole."""
+SHARE_KEPT = 0.9
+"""Share of the samples that is kept when some are discarded."""
+
+
+class HandStore:
+    """
+    A bounded store of ImuSamples with increasing stamps.
+
+    Parameters
+    ----------
+    most : int
+        Samples kept at most.
+
+    """
+
+    def __init__(self, most: int):
+        self.most, self._parts, self._epoch = most, [], 0
+        self._shift, self.forgotten = 0, 0
+
+    def __len__(self):
+        return sum(len(part) for part in self._parts)
+
+    def copy(self) -> 'HandStore':
+        """Return a copy that shares the samples."""
+        twin = HandStore(self.most)
+        twin.__dict__ |= self.__dict__ | {'_parts': list(self._parts)}
+        return twin
+
+    def add(self, accepted: Iterable[tuple[int, ImuSamples]]) -> None:
+        """Add the output of a StreamCheck: (epoch, ImuSamples), ...; stamps continue to increase at a clock reset."""
+        for epoch, samples in accepted:
+            if not len(samples):
+                continue
+            if epoch != self._epoch and self._parts:
+                self._shift = int(self._parts[-1].stamp_ns[-1]) + PAUSE_NS - int(samples.stamp_ns[0])
+            self._epoch = epoch
+            self._parts.append(ImuSamples(samples.stamp_ns + self._shift, samples.force_s, samples.rate_s, samples.frame_id))
+
+    def samples(self) -> ImuSamples | None:
+        """Return all samples, or None."""
+        if not self._parts:
+            return None
+        self._parts = [ImuSamples.concatenate(self._parts)]
+        return self._parts[0]
+
+    def true_stamps(self, stamp_ns: np.ndarray) -> np.ndarray:
+        """Return the header stamps of samples of the present epoch."""
+        return stamp_ns - self._shift
+
+    def forget(self, rests: Sequence[slice], most_rests: int) -> bool:
+        """
+        Discard samples above the limit: the inside of the longest rest if that suffices, otherwise the oldest; return whether any were.
+
+        Parameters
+        ----------
+        rests : list of slice
+            Ranges at rest among `samples`.
+        most_rests : int
+            Largest number of rests; the oldest are discarded first.
+
+        """
+        imu = self.samples()
+        if imu is None:
+            return False
+        if len(rests) > most_rests:
+            self._drop(imu, slice(0, rests[len(rests) - int(SHARE_KEPT * most_rests)].start))
+        elif len(self) > self.most:
+            self._drop(imu, self._least_telling(imu, rests, len(imu) - int(SHARE_KEPT * self.most)))
+        else:
+            return False
+        return True
+
+    def _least_telling(self, imu, rests, count):
+        long = max(_across_holes(imu.stamp_ns, rests), key=lambda rest: rest.stop - rest.start, default=slice(0, 0))
+        kept = int(REST_KEPT * 1e9 / max(np.median(np.diff(imu.stamp_ns)), 1))
+        return slice(long.start + kept, long.start + kept + count) if long.stop - long.start >= count + 2 * kept else slice(0, count)
+
+    def _drop(self, imu, gone):
+        keep = np.ones(len(imu), bool)
+        keep[gone] = False
+        self.forgotten += int(np.count_nonzero(~keep))
+        self._parts = [imu.select(keep)]
+
+    def to_bytes(self) -> bytes:
+        """Return the samples as an npz archive."""
+        target, imu = io.BytesIO(), self.samples()
+        if imu is None:
+            imu = ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+        np.savez(target, format=np.array(FORMAT), frame_id=np.array(imu.frame_id), stamp_ns=imu.stamp_ns, force_s=imu.force_s,
+                 rate_s=imu.rate_s)
+        return target.getvalue()
+
+    def load(self, data: bytes) -> None:
+        """
+        Insert saved samples before new ones, as a recording with a pause in it.
+
+        Raises
+        ------
+        DocumentError
+            When the bytes are no such archive.
+
+        """
+        try:
+            with load_arrays(data) as arrays:
+                if str(arrays['format']) != FORMAT:
+                    raise DocumentError(f"samples must have the format '{FORMAT}', got '{arrays['format']}'; remove the file, or start "
+                                        'without resume')
+                imu = ImuSamples(arrays['stamp_ns'], arrays['force_s'], arrays['rate_s'], str(arrays['frame_id']))
+            for values, kind, shape in ((imu.stamp_ns, 'i', ()), (imu.force_s, 'f', (3,)), (imu.rate_s, 'f', (3,))):
+                if values.dtype.kind != kind or values.shape != (imu.stamp_ns.size, *shape):
+                    raise ValueError(f'it holds {values.dtype} of shape {values.shape}')
+        except ImuCalibrationError:
+            raise
+        except Exception as error:   # damaged archives and arrays raise many kinds
+            raise DocumentError(f'saved samples must be a whole file of {FORMAT}, this is not '
+                                f'({shortened(f"{type(error).__name__}: {error}", 200)}); remove it, or start without resume',
+                                code='samples_damaged') from error
+        if len(imu):
+            self._parts, self._epoch = [imu], -1
+
+
+def _across_holes(stamp_ns, rests):
+    """Return the ranges at rest, joined where only discarded samples and the time excluded after a hole lie between them."""
+    joined, hole = [], 5 * np.median(np.diff(stamp_ns)) * 1e-9
+    for rest in rests:
+        between = np.diff(stamp_ns[joined[-1].stop - 1:rest.start + 1]) * 1e-9 if joined else np.zeros(0)
+        if len(between) and between.max() > hole and between.sum() - between.max() < HELD_OUT:
+            joined[-1] = slice(joined[-1].start, rest.stop)
+        else:
+            joined.append(rest)
+    return joined

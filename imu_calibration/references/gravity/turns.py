@@ -1,0 +1,139 @@
+"""Usable turns between poses, from samples."""
+
+import numpy as np
+
+from imu_calibration.core.samples import ImuSamples, runs_of
+from imu_calibration.preprocessing.stamping import LAG, LATE, MOST_LOST, WHOLE
+from imu_calibration.references.gravity.equations import Poses, TurnData
+from imu_calibration.references.gravity.hand_options import ByHandSettings, KnownTurn
+
+TOP = 20
+"""Readings below the largest whose density is estimated."""
+CROWDED = 20.0
+"""The extreme is the end of the range when it has this many times the readings expected by chance."""
+CERTAIN = 1e-3
+"""If fewer readings than this are expected, two equal ones are the end of the range, also neighbours."""
+LINE = 20.0
+"""Duration over which a clock is straight, s: long against the jitter of its stamps, short against the drift of its rate."""
+UNDECIDED = 1.02
+"""Factor by which interpolation errors at even times may exceed those at the stamps, due to noise."""
+SUMMIT = 3
+"""Neighbours in one coarse step at the top of a smooth turn."""
+
+
+def collect_turns(time: np.ndarray, imu: ImuSamples, *, poses: Poses, settings: ByHandSettings,
+                  temperature_c: np.ndarray | None = None) -> tuple[list[TurnData], dict[str, int]]:
+    """Return (turns between consecutive poses, {reason: count of excluded ones}); `temperature_c` is that of the samples or None."""
+    turns, dropped, rate = [], {}, imu.rate_s
+    limit = max(settings.gap, 5 * poses.period)
+    ended = at_range_end(rate)
+    density = np.mean(poses.noise['gyroscope'].low_variance) * poses.period
+    for first in range(len(poses.start) - 1):
+        piece = slice(poses.stop[first] - 1, poses.start[first + 1] + 1)
+        reason = _unusable(time[piece], ended[piece], limit, settings.turn_maximum)
+        if reason:
+            dropped[reason] = dropped.get(reason, 0) + 1
+            continue
+        turns.append(TurnData(time[piece], rate[piece], imu.force_s[piece], first, first + 1, density * (time[piece][-1] - time[piece][0]),
+                              temperature_c=None if temperature_c is None else temperature_c[piece]))
+    return turns, dropped
+
+
+def _unusable(time, ended, gap, longest):
+    if time[-1] - time[0] > longest:
+        return 'too long'
+    if np.max(np.diff(time)) > gap:
+        return 'gap'
+    return 'clipped' if ended.any() else ''
+
+
+def at_range_end(rate: np.ndarray) -> np.ndarray:
+    """
+    Return which samples are at the end of the gyroscope's range, shape (n,).
+
+    At the end of the range, different motions end at the same reading, on either side and on all axes; without it two readings are
+    hardly ever both the largest, if the converter's step is finer than the distance between the largest readings.
+
+    Parameters
+    ----------
+    rate : array, shape (n, 3)
+        Readings in any unit.
+
+    """
+    fresh = np.concatenate([[True], np.any(np.diff(rate, axis=0) != 0, axis=1)])   # a reading published twice is one reading
+    ended = np.zeros(len(rate), bool)
+    for signed in (np.abs(rate), *(sign * rate[:, [axis]] for axis in range(3) for sign in (1, -1))):
+        ended |= _at_end(signed, fresh)
+    return ended
+
+
+def _at_end(values, fresh):
+    """Return the rows with a value at the largest of all `values` (n, m), when that is the end of a range."""
+    some = np.sort(values[fresh].ravel())[-4000:]
+    step = np.diff(some)
+    step = step[step > 1e-9 * np.abs(some[-1])].min(initial=np.inf)
+    margin = 1.5 * step if np.isfinite(step) and values.shape[1] > 1 else 0.5 * step   # two's complement: one end is larger by a step
+    margin = min(margin, 1e-4 * np.abs(some[-1]))
+    at = (values >= some[-1] - margin).any(axis=1)
+    below = some[some < some[-1] - margin][-TOP:]
+    if len(below) < TOP:
+        return np.zeros(len(values), bool)
+    chance = TOP * (margin + 0.5 * step) / (some[-1] - below[0]) if np.isfinite(step) else 0.0
+    runs = np.diff(runs_of(at[fresh]))
+    # the top of one smooth turn may fill a coarse step for some samples
+    number = runs.sum() if chance < CERTAIN else np.maximum(runs - SUMMIT, 0).sum() + len(runs)
+    return at if number >= max(2, CROWDED * chance) else np.zeros(len(values), bool)
+
+
+def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, *, poses: Poses, settings: ByHandSettings,
+                    temperature_c: np.ndarray | None = None) -> TurnData:
+    """Return the data of a `KnownTurn`; the sd of its axis is that of the settings, across the axis."""
+    axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
+    along = np.outer(axis, axis)
+    cov = settings.known_turn_sd**2 * along + (turn.angle * settings.known_axis_sd)**2 * (np.eye(3) - along)
+    piece = slice(turn.start, turn.stop)
+    density = np.mean(poses.noise['gyroscope'].white_variance) * poses.period
+    noise_variance = density * (time[piece][-1] - time[piece][0])
+    return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=noise_variance, rotation=turn.angle * axis,
+                    rotation_cov=cov, temperature_c=None if temperature_c is None else temperature_c[piece])
+
+
+def sample_times(imu: ImuSamples) -> np.ndarray:
+    """
+    Return the times of samples since the first one, s, shape (n,): of the clock fitted to the stamps, or the stamps.
+
+    An even clock is a straight line through the stamps over the count of the samples, in pieces of `LINE` seconds. It is used unless the
+    readings interpolate better from their neighbours at the stamps, as with a driver that polls the sensor at uneven times.
+    """
+    stamps = rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
+    even, period = stamps.copy(), float(np.median(np.diff(stamps)))
+    step = np.diff(stamps) / period
+    count = np.where((step > LATE) & (np.abs(step - np.rint(step)) <= WHOLE), np.rint(step), 1.0)
+    number, edges = np.concatenate([[0.0], np.cumsum(count)]), np.flatnonzero(step > MOST_LOST + LATE) + 1
+    for part in np.split(np.arange(len(stamps)), edges):
+        if len(part) >= 2 * LAG:
+            lines = (_clock_line(each, stamps[part], max(1, int(period * len(part) / LINE))) for each in (number[part], part))
+            line = min(lines, key=lambda line: np.sum((stamps[part] - line)**2))   # long steps of a rebuilt clock need not be lost samples
+            late = np.array([piece.mean() for piece in np.array_split(stamps[part] - line, len(part) // LAG)])
+            even[part] = line if np.abs(late).max() < 0.6 * period else even[part]   # otherwise samples were lost unnoticed
+    return even if np.all(np.diff(even) > 0) and _roughness(even, imu.rate_s) <= UNDECIDED * _roughness(stamps, imu.rate_s) else stamps
+
+
+def _clock_line(number, time, pieces):
+    line = np.polynomial.Polynomial.fit(number, time, 1)(number)
+    means = np.array([[part.mean() for part in np.array_split(values, pieces)] for values in (number, time - line)])
+    return line + np.interp(number, *means)
+
+
+def _roughness(time, rate):
+    """Return the sum of squared errors of linear interpolation between the two neighbours of each reading."""
+    share = ((time[1:-1] - time[:-2]) / (time[2:] - time[:-2]))[:, None]
+    return float(np.sum((rate[1:-1] - (1 - share) * rate[:-2] - share * rate[2:])**2))
+
+
+def rising(time: np.ndarray) -> np.ndarray:
+    """Spread repeated stamps over the following step: their order is known, their times are not."""
+    if np.all(np.diff(time) > 0):
+        return time
+    kept = np.concatenate([[True], np.diff(time) > 0])
+    return np.interp(np.arange(len(time)), np.flatnonzero(kept), time[kept]) + 1e-9 * np.arange(len(time))

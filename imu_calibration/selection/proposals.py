@@ -1,0 +1,265 @@
+"""A formula for the unexplained residual: search, test on held-out windows, description and a term for a model."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imu_calibration.core.units import for_people, with_sd
+from imu_calibration.effects.base import AXES, SENSORS, SHORT, Effect
+from imu_calibration.effects.term import term
+from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
+from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.explained_share import LEAST_SHARE_SMOOTH
+from imu_calibration.selection.formulas import FormulaChoice, FormulaSearch
+from imu_calibration.selection.grammar import Formula, grammar
+from imu_calibration.selection.residual_blocks import RestBlocks
+from imu_calibration.selection.residual_fit import BlockFit, BlockFits, share_interval, share_removed
+
+LEAST_SHARE = 0.6
+"""Share of the excess that a formula removes from held-out windows at least."""
+WORTH_A_SECOND = 0.1
+"""Share that a second formula adds at least."""
+MOST_TERMS = 2
+ONE_SHAPE = 0.9
+"""Share of a formula's amplitudes, all axes, that one shape must have to replace all of it."""
+OTHER_SENSOR = 3.0
+"""Standard deviations by which a cause of the table may differ from the estimate of the other sensor."""
+SHOWN_ALIKE = 3
+"""Largest number of reported formulas of a class."""
+SEEN = 4.0
+"""Standard deviations from which an axis counts as concerned."""
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """Formulas that explain most of a sensor's residual outside the catalogue."""
+
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    effects: tuple[Effect, ...]
+    """The formulas as terms: each a text, a unit and a tolerance."""
+    values: tuple[np.ndarray, ...]
+    """Their amplitudes on the three axes, SI."""
+    sds: tuple[np.ndarray, ...]
+    """Standard deviations, with the misfit in them."""
+    family: frozenset[str]
+    """Quantities in them."""
+    axes: tuple[str, ...]
+    """Axes of the sensor on which they show."""
+    share: float
+    """Share of the rest that they remove from held-out windows, in squares."""
+    ci95: tuple[float, float]
+    """Its interval."""
+    reduction: float
+    """By how much the rms beyond noise falls there, as a share."""
+    p_value: float
+    """Probability of the first by noise, times the number of formulas."""
+    alike: tuple[str, ...]
+    """Formulas that are not separable from the first in this recording."""
+    nearest: tuple[str, float] | None
+    """Effect of the catalogue that fits best, and the share that it removes."""
+    motion: str
+    """A motion that would confirm it."""
+    sizes: tuple[float, ...] = field(default=())
+    """Rms of each formula's contribution over the recording, m/s^2 or rad/s."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The formulas as texts."""
+        return tuple(_text_of(effect) for effect in self.effects)
+
+    @property
+    def sentence(self) -> str:
+        """Description of the proposal with the motion that confirms it."""
+        return self.relation + (f'; to confirm it: {self.motion}' if self.motion else '')
+
+    @property
+    def relation(self) -> str:
+        """Description of the proposal."""
+        parts = [f'{_size(effect, value, sd)}' for effect, value, sd in zip(self.effects, self.values, self.sds)]
+        text = (f'{100 * self.share:.0f} % of it ({100 * self.ci95[0]:.0f} to {100 * self.ci95[1]:.0f} %, on windows held out) follows '
+                + ' and '.join(f'{column}, {part}' for column, part in zip(self.columns, parts)))
+        if self.nearest is not None:
+            text += (f'; it is not in the catalogue: {self.nearest[0]}, the closest effect, '
+                     f'would remove {100 * max(self.nearest[1], 0.0):.0f} %')
+            text += ' here, but the remaining axes or sensor contradict it' * (self.nearest[1] > LEAST_SHARE)
+        if self.alike:
+            text += f'; collinear in this recording: {" or ".join(self.alike)}'
+        return text
+
+    def to_mapping(self) -> dict:
+        """Return the proposal as plain data."""
+        terms = [{'name': effect.name, 'definition': effect.definition, 'value': value.tolist(), 'sd': sd.tolist(), 'rms': size}
+                 for effect, value, sd, size in zip(self.effects, self.values, self.sds, self.sizes)]
+        return {'terms': terms, 'axes': list(self.axes), 'share_of_unexplained': self.share, 'ci95': list(self.ci95),
+                'rms_reduction': self.reduction,
+                'p_value': self.p_value, 'indistinguishable_from': list(self.alike),
+                'nearest_of_the_catalogue': None if self.nearest is None else {'effect': self.nearest[0], 'share': self.nearest[1]},
+                'confirming_motion': self.motion, 'sentence': self.sentence}
+
+
+def propose(blocks: RestBlocks, attempt: Attempt, fits: BlockFits) -> Proposal | None:
+    """
+    Return a Proposal for the residual of a sensor with the chosen effects, or None where no formula removes most of it.
+
+    Formulas are chosen on the selection windows, with all plausible contributions of the catalogue projected out; the share is
+    from the locked windows with the findings in the model, and both halves of the selection windows must agree.
+    """
+    search = FormulaSearch(blocks, _grammar(blocks), _plausible(blocks.sensor, attempt),
+                           reference_temperature=attempt.recording.model.temperature_ref_c)
+    plain = fits.fit()
+    if plain.excess <= 0:
+        return None
+    choices: list[FormulaChoice] = []
+    share = 0.0
+    while len(choices) < MOST_TERMS:
+        found = search.best()
+        if found is None or not _stable(fits, [*choices, found]):
+            break
+        grown = share_removed(plain, fits.fit(_joined([*choices, found])))
+        if choices and grown < share + WORTH_A_SECOND:
+            break
+        choices, share = [*choices, found], grown
+        search.take(found)
+    needed = LEAST_SHARE_SMOOTH if any(choice.formula.smooth for choice in choices) else LEAST_SHARE
+    if not choices or share < needed:
+        return None
+    return _told(blocks, attempt, fits, plain, choices)
+
+
+def _plausible(sensor, attempt):
+    """
+    Return a factor of the covariance that the catalogue's parameters may have, shape (q, q).
+
+    A cause in the table acts on both sensors: its explained share here is limited by its estimate there.
+    """
+    plausible = np.diag(attempt.space.prior_sd)
+    other = next(each for each in SENSORS if each != sensor)
+    for question in attempt.questions:
+        if question.sensor not in SENSORS and other in question.effect.acts_on and len(question.effect.acts_on) > 1:
+            own = list(question.parameters)
+            known = attempt.evidence.known_from(other, [*attempt.search.baseline, *own])[-len(own):, -len(own):]
+            plausible[np.ix_(own, own)] = OTHER_SENSOR * np.linalg.cholesky(known)
+    return plausible
+
+
+def _grammar(blocks):
+    duration = float(f'{max(float(np.ptp(blocks.time)), 1.0):.2g}')
+    return grammar(blocks.ref.joint_angle.shape[1], blocks.warms, duration)
+
+
+def _joined(choices):
+    return np.concatenate([choice.columns for choice in choices], axis=1)
+
+
+def _stable(fits, choices):
+    """Return whether the halves of the recording agree on the last choice within their precision."""
+    width = choices[-1].columns.shape[1]
+    early, late, whole = (fits.fit(_joined(choices), half=half) for half in (0, 1, None))
+    apart = ((early.amplitudes - late.amplitudes) / np.sqrt(early.sd**2 + late.sd**2))[-width:]
+    strength = (whole.amplitudes / whole.sd)[-width:]
+    return bool((apart**2).mean() < 9.0 or (apart**2).sum() < 0.1 * (strength**2).sum())
+
+
+def _told(blocks, attempt, fits, plain, choices):
+    terms = [entry for choice in choices for entry in _shapes(fits, choices, choice)][:MOST_TERMS]
+    columns = np.concatenate([column for column, _, _ in terms], axis=1)
+    after = fits.fit(columns)
+    share = share_removed(plain, after)
+    effects = tuple(_effect(blocks.sensor, number, text, formula, after.amplitudes[number], _taken(attempt))
+                    for number, (_, text, formula) in enumerate(terms))
+    seen = np.abs(after.amplitudes) > SEEN * after.sd
+    rms = np.sqrt((columns**2).mean(axis=0))
+    strong = (np.abs(after.amplitudes) * rms).sum(axis=0)
+    axes = tuple(axis for k, axis in enumerate(AXES) if seen[:, k].any() and strong[k] > 0.1 * strong.max())
+    return Proposal(
+        blocks.sensor, effects, tuple(after.amplitudes), tuple(after.sd), frozenset().union(*(formula.family for _, _, formula in terms)),
+        axes,
+        share, share_interval(plain, after, np.random.default_rng(1)), 1.0 - float(np.sqrt(max(1.0 - share, 0.0))), choices[0].p_value,
+        tuple(_shown(formula) for formula in choices[0].alike[:SHOWN_ALIKE]), _nearest(fits, plain, attempt), _motion(effects),
+        tuple(float(np.sqrt((rms[k]**2 * amplitude**2).sum())) for k, amplitude in enumerate(after.amplitudes)))
+
+
+def _shapes(fits, choices, choice):
+    """Return (column means (b, 1, 3), text or three texts, Formula) of the one or two shapes that hold a choice's amplitudes."""
+    formula, columns = choice.formula, choice.columns
+    if len(formula.columns) == 1:
+        return [(columns, formula.columns[0], formula)]
+    first = sum(other.columns.shape[1] for other in choices[:choices.index(choice)])
+    amplitudes = fits.fit(_joined(choices)).amplitudes[first:first + columns.shape[1]]
+    scale = np.sqrt((columns**2).mean(axis=(0, 2)))
+    left, sizes = np.linalg.svd(amplitudes * scale[:, None])[:2]
+    count = 1 if sizes[0]**2 > ONE_SHAPE * (sizes**2).sum() else 2
+    found = []
+    for weights in (left[:, :count] / scale[:, None]).T:
+        weights = weights / weights[np.argmax(np.abs(weights))]
+        if formula.phased:
+            phase = float(f'{np.arctan2(weights[1], weights[0]):.4g}')
+            weights, text = np.array([np.cos(phase), np.sin(phase)]), formula.phased.format(phase=phase).replace('- -', '+ ')
+        else:
+            weights = np.where(np.abs(weights) * scale > 0.03 * np.max(np.abs(weights) * scale),
+                               np.array([float(f'{w:.4g}') for w in weights]), 0.0)
+            text = _summed(formula.columns, weights)
+        found.append((np.einsum('bka,k->ba', columns, weights)[:, None], text, formula))
+    return found
+
+
+def _summed(columns, weights):
+    """Return the text, or three texts, of a weighted sum of columns."""
+    if not isinstance(columns[0], str):
+        return tuple(_summed([column[axis] for column in columns], weights) for axis in range(3))
+    return ' + '.join(f'{weight:g} * {column}' if weight != 1.0 else column for column, weight in zip(columns, weights) if weight)
+
+
+def _taken(attempt):
+    return {name for _, name in attempt.baseline.catalogue.effects(attempt.baseline.joint_names)}
+
+
+def _effect(sensor, number, text, formula, values, taken):
+    unit = formula.unit('m/s^2' if sensor == SENSORS[0] else 'rad/s')
+    largest = float(np.abs(values).max())
+    names = (f'{SHORT[sensor]}_proposed_{k}' for k in range(1, 100))
+    free = [name for name in names if name not in taken][number]
+    return term(free, sensor=sensor, column=text if isinstance(text, str) else list(text), unit=unit, tolerance=_digits(0.1 * largest),
+                tolerance_reason='a tenth of the estimate', prior_sd=_digits(10 * largest), largest=_digits(3 * largest),
+                text=f'The {sensor} output follows {_joined_text(text)}: a formula that a diagnosis proposed, its cause is not known.')
+
+
+def _digits(value):
+    return float(f'{value:.2g}')
+
+
+def _joined_text(text):
+    return text if isinstance(text, str) else f'({", ".join(text)})'
+
+
+def _text_of(effect):
+    column = effect.definition['column']
+    return _joined_text(column if isinstance(column, str) else tuple(column))
+
+
+def _shown(formula: Formula) -> str:
+    return _joined_text(formula.columns[0]) + ' in any phase' * (len(formula.columns) > 1)
+
+
+def _size(effect, values, sd):
+    k = int(np.argmax(np.abs(values)))
+    factor, unit = for_people(effect.unit_of(k), effect.sensor)
+    return f"{' ± '.join(with_sd(values[k] * factor, sd[k] * factor))} {unit} on {AXES[k]}"
+
+
+def _motion(effects):
+    texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
+    return '; '.join(dict.fromkeys(texts[name] for effect in effects for name in effect.motion[:1] if name in texts))
+
+
+def _nearest(fits: BlockFits, plain: BlockFit, attempt: Attempt) -> tuple[str, float] | None:
+    """Return (effect, share removed) of the best fit in the catalogue."""
+    best: tuple[str, float] | None = None
+    for question in attempt.questions:
+        if set(question.parameters) <= fits.used or not any(np.isin(question.parameters, index).any() for index in fits.blocks.index):
+            continue
+        share = share_removed(plain, fits.fit(more=question.parameters))
+        if best is None or share > best[1]:
+            best = (question.name, share)
+    return best

@@ -1,0 +1,169 @@
+"""The search of `calibrate` and `diagnose`: supported effects, without findings that a formula or a regime replaces."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+
+import numpy as np
+
+from imu_calibration.effects.base import AXES
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.selection.explained_share import sensors_of
+from imu_calibration.selection.investigation import Investigation, investigate
+from imu_calibration.selection.proposals import Proposal, propose
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.regimes import MOST_OF_IT, RestRegime, find_regimes
+from imu_calibration.selection.residual_blocks import RestBlocks, rest_blocks
+from imu_calibration.selection.residual_fit import BlockFits
+from imu_calibration.selection.unexplained import Unexplained, unexplained
+
+CLEAR = 10.0
+"""Standard deviations above noise at rest from which a formula is searched in moving blocks."""
+NOT_NEEDED = 0.05
+"""Least share of a finding's reduction of the residual that must remain with a formula or a regime in the model."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Examination(Investigation):
+    """An Investigation with the residual analysis of each sensor, evaluated lazily and cached."""
+
+    table: Table
+    """The reference."""
+    _fits: dict = field(default_factory=dict, init=False, repr=False)
+    _proposals: dict = field(default_factory=dict, init=False, repr=False)
+
+    @classmethod
+    def of(cls, found: Investigation, table: Table) -> 'Examination':
+        """Return an Investigation as an Examination; an Examination is returned unchanged."""
+        return found if isinstance(found, cls) else cls(**{each.name: getattr(found, each.name) for each in fields(found)}, table=table)
+
+    @cached_property
+    def rests(self) -> dict[str, Unexplained]:
+        """Sensor -> Unexplained, with the axes that carry it where it is significant."""
+        found = unexplained(self.attempt, self.explained, self.named)
+        return {sensor: replace(rest, axes=self.fits(sensor).axes()) if rest.significant else rest for sensor, rest in found.items()}
+
+    @cached_property
+    def blocks(self) -> dict[str, RestBlocks]:
+        """Sensor -> RestBlocks."""
+        return rest_blocks(self.used, self.table, self.attempt, explained=self.explained)
+
+    def fits(self, sensor: str, chosen: Sequence[Question] | None = None) -> BlockFits:
+        """Return the fits of a choice, of the findings where not given, to the blocks of a sensor."""
+        space, used = self.attempt.space, tuple(self.search.used(self.named if chosen is None else chosen))
+        if (sensor, used) not in self._fits:
+            self._fits[sensor, used] = BlockFits(self.blocks[sensor], used, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
+        return self._fits[sensor, used]
+
+    def regimes(self, sensor: str, chosen: Sequence[Question] | None = None) -> list[RestRegime]:
+        """Return the regimes of a sensor's residual with a choice in the model; default: the findings (`find_regimes`)."""
+        return find_regimes(self.blocks[sensor], self.attempt, self.search.used(self.named if chosen is None else chosen),
+                            joint_names=self.table.joint_names)
+
+    def proposal(self, sensor: str) -> Proposal | None:
+        """
+        Return a formula for the residual of a sensor, where it is significant or clear within moving windows.
+
+        Variation within moving windows is modelled as noise; a formula that explains it shows that it is deterministic.
+        """
+        if sensor not in self._proposals:
+            fits = self.fits(sensor)
+            clear = self.rests[sensor].significant or fits.sigma > CLEAR
+            self._proposals[sensor] = propose(self.blocks[sensor], self.attempt, fits) if clear else None
+        return self._proposals[sensor]
+
+    def free(self) -> None:
+        """Free the blocks and their fits; they are computed again on demand."""
+        self.__dict__.pop('blocks', None)
+        self._fits.clear()
+
+    def without(self, gone: Sequence[Question]) -> 'Examination':
+        """Return the Examination without some findings; they remain doubtful, and widen the uncertainty of all other ones."""
+        names = {question.name for question in gone}
+        other = replace(self, named=[question for question in self.named if question not in gone], doubtful=[*self.doubtful, *gone],
+                        rivals=[rival for rival in self.rivals if rival.question.name not in names])
+        other.__dict__['blocks'] = self.blocks
+        return other
+
+
+def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
+            bias_processes: dict | None = None) -> Examination:
+    """
+    Test every effect that a model lacks (`investigate`), and withdraw findings that a formula or a regime replaces.
+
+    Parameters
+    ----------
+    windows, table, model, progress, bias_processes
+        As for `investigate`.
+
+    Raises
+    ------
+    NotObservableError
+        As `investigate`.
+
+    """
+    return without_superseded(Examination.of(investigate(windows, table, model, progress=progress, bias_processes=bias_processes), table))
+
+
+def without_superseded(found: Examination) -> Examination:
+    """Return the Examination without findings that a formula or a place does without."""
+    while found.named and (gone := superseded(found)):
+        found = found.without(gone)
+    return found
+
+
+def superseded(found: Examination) -> list[Question]:
+    """
+    Return the findings that a formula or a regime replaces: they approximated the part that correlates with them.
+
+    A response to the cube of a force is three quarters a response to the force; its residual would be reported as a formula in addition to
+    a wrong effect; a step at warm temperature is like a polynomial of the temperature. So each finding is omitted once, in all sensors on
+    which it acts, and is kept if held-out windows need it in addition to the substitute: the formula for the residual of all findings, a
+    formula for the residual without it, or the regimes of that. This is tested where a residual remains; for effects of the temperature
+    always: settling or a step during the warm-up is so similar that hardly any residual remains.
+    """
+    return [question for question in found.named if _done_without(found, question)]
+
+
+def _done_without(found, question):
+    """Return whether a finding hardly reduces the residual of its sensors with a substitute in some of them."""
+    sensors = sensors_of(question.effect)
+    warm = 'temperature' in question.effect.needs
+    asked = [sensor for sensor in sensors if warm or found.rests[sensor].significant or found.proposal(sensor)]
+    if not asked:
+        return False
+    others = [other for other in found.named if other is not question]
+    kept, left_out = ({sensor: found.fits(sensor, some) for sensor in sensors} for some in (found.named, others))
+    alone = {sensor: left_out[sensor].fit().excess - kept[sensor].fit().excess for sensor in sensors}
+    for stand_in in (lambda sensor: _columns(found, sensor, found.proposal(sensor)),
+                     lambda sensor: _columns(found, sensor, propose(found.blocks[sensor], found.attempt, left_out[sensor])),
+                     lambda sensor: _places(found, sensor, others)):
+        beside = dict(alone)
+        for sensor in asked:
+            columns = stand_in(sensor)
+            if columns is not None:
+                beside[sensor] = left_out[sensor].fit(columns).excess - kept[sensor].fit(columns).excess
+        if sum(beside.values()) < NOT_NEEDED * sum(alone.values()):
+            return True
+    return False
+
+
+def _columns(found, sensor, proposal):
+    """Return the columns of the formulas of a proposal over the blocks of a sensor, shape (b, k, 3), or None without one."""
+    if proposal is None:
+        return None
+    blocks = found.blocks[sensor]
+    groups = [group for effect in proposal.effects for group in effect.groups]
+    known = {'temperature_ref_c': found.attempt.recording.model.temperature_ref_c}
+    means = [blocks.means(group.columns(blocks.ref, known)) for group in groups]
+    return np.stack([np.broadcast_to(mean, (len(mean), 3)) for mean in means], axis=1)
+
+
+def _places(found, sensor, chosen):
+    """Return an indicator column of the regimes where an offset explains most of an axis' residual, shape (b, 1, 3), or None."""
+    offsets = [regime for regime in found.regimes(sensor, chosen) if regime.offset and regime.share >= MOST_OF_IT]
+    first = {regime.axis: regime.inside for regime in reversed(offsets)}
+    nowhere = np.zeros(len(found.blocks[sensor].time))
+    return np.stack([first.get(axis, nowhere) for axis in AXES], axis=1)[:, None].astype(float) if first else None

@@ -1,0 +1,223 @@
+"""The residual of one sensor in short blocks, with the columns of all candidate effects: data for regimes and formulas."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.columns import References, columns
+from imu_calibration.effects.forward_equations import predict
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_at_rest import LEAST_NOISE
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window, all_samples, chunks
+from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.explained_share import Explained
+from imu_calibration.selection.noise_beside_effects import natural_processes
+from imu_calibration.selection.questions import TEMPERATURE_SPAN
+
+BLOCK = 0.25
+"""Least length of a block of a moving window, s; at rest a window is one block."""
+MOST_BLOCKS = 1200
+"""Blocks of one recording, about: their full covariance is factored."""
+AT_A_TIME = 256
+"""Blocks whose columns are in memory at once."""
+WITHIN = 5
+"""Rows at which the columns of a block are evaluated."""
+
+
+@dataclass(frozen=True, eq=False)
+class RestBlocks:
+    """Means over blocks of one sensor's residual and of the columns of all candidate effects."""
+
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    ref: Reference
+    """True motion at the rows within the blocks, in order of blocks."""
+    starts: np.ndarray
+    """First row of each block, shape (b,)."""
+    time: np.ndarray
+    """Middle of each block, s, shape (b,)."""
+    window: np.ndarray
+    """Number of the window of each block, shape (b,)."""
+    locked: np.ndarray
+    """Mask of blocks in locked windows, shape (b,)."""
+    design: tuple
+    """Per axis ``[columns of the parameters that act on it | residual]``, shape (b, q_a + 1)."""
+    index: tuple
+    """Per axis the parameters of the space that these columns belong to."""
+    variance: np.ndarray
+    """Variance of a block's residual by the white noise, shape (b, 3)."""
+    processes: tuple
+    """How every bias moves (BiasProcess)."""
+
+    @property
+    def warms(self) -> bool:
+        """Whether the temperature is known and changes by as much as a thermal effect needs to show."""
+        return self.ref.temperature_c is not None and bool(np.ptp(self.ref.temperature_c) >= TEMPERATURE_SPAN)
+
+    def means(self, rows: np.ndarray) -> np.ndarray:
+        """Return means over the blocks of something known at the rows, shape (b, ...)."""
+        return _means(rows, self.starts)
+
+    def whitener(self, select: np.ndarray) -> 'BlockWhitener':
+        """Return the whitener of the blocks `select` (mask): independent, of unit variance."""
+        return BlockWhitener(self, select)
+
+
+class BlockWhitener:
+    """Makes rows of some blocks independent: white noise of each block and a bias that moves."""
+
+    def __init__(self, blocks: RestBlocks, select: np.ndarray):
+        variance, time = blocks.variance[select], blocks.time[select]
+        self.scale = np.sqrt(np.median(variance / variance.mean(axis=1, keepdims=True), axis=0))
+        apart = np.abs(time[:, None] - time[None, :])
+        covariance = np.diag(variance.mean(axis=1))
+        for process in blocks.processes:
+            covariance += process.sd**2 * np.exp(-apart / process.time)
+        self._factor, self._select = np.linalg.cholesky(covariance), select
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """Return whitened rows, shape of the selection; divide by ``scale[axis]`` for an axis."""
+        return solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False)
+
+
+def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, explained: Explained) -> dict[str, RestBlocks]:
+    """
+    Return sensor -> RestBlocks of the windows that an attempt reduced.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        Windows of the fit, in order.
+    table : Table
+    attempt : Attempt
+        The linearisation of the columns.
+    explained : Explained
+        Expected loss from noise.
+
+    """
+    length = max(BLOCK, sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1) / MOST_BLOCKS)
+    which = _some(windows, length)
+    windows = [windows[k] for k in which]
+    parts = [_cut(window, length) for window in windows]
+    motion = JointMotion.joined([w.motion.select(part.rows) for w, part in zip(windows, parts)])
+    warm = all(w.temperature_c is not None for w in windows)
+    temperature = np.concatenate([part.of_rows(w.temperature_c) for w, part in zip(windows, parts)]) if warm else None
+    per_block = np.concatenate([part.per_block for part in parts])
+    place = np.repeat(np.arange(len(windows)), [len(part.per_block) for part in parts])
+    number = which[place]
+    count = np.concatenate([part.count for part in parts])
+    common = {'starts': np.cumsum(np.append(0, per_block[:-1])),
+              'time': np.concatenate([part.means(w.time) for w, part in zip(windows, parts)]),
+              'window': number, 'locked': attempt.locked[number]}
+    references = References(attempt.recording.model, table, motion, temperature_c=temperature)
+    columns_of = _block_means(attempt, table, motion, temperature, common['starts'])
+    found, edges = {}, np.concatenate([part.edges[:-1] + first for part, first in zip(parts, np.cumsum([0, *map(len, windows[:-1])]))])
+    for sensor, residual in residuals(windows, table, attempt.recording.model, values=attempt.recording.values).items():
+        mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
+        floor = explained.floor.noise[sensor]
+        busier = _busier(windows, sensor, floor, attempt.recording.kind[which], ~attempt.locked[which])
+        variance = floor.low_variance * busier[place] / count[:, None]
+        # An estimated bias process would absorb a step or a warm-up; regimes are searched with the least bias processes.
+        processes = natural_processes(floor, attempt.recording.period)
+        rows = np.concatenate([columns_of[sensor], mean], axis=1)
+        design = tuple(rows @ join for join in attempt.space.join[sensor])
+        found[sensor] = RestBlocks(sensor, references.at(sensor), **common, design=design, index=tuple(attempt.space.index[sensor]),
+                                   variance=variance, processes=processes)
+    return found
+
+
+def _some(windows, length):
+    """Return the numbers of the windows in use: all, or a random part of a long recording, in order."""
+    blocks = sum(1 if len(w.motion) == 1 else max(1, round((w.time[-1] - w.time[0]) / length)) for w in windows)
+    if blocks <= 2 * MOST_BLOCKS:
+        return np.arange(len(windows))
+    return np.sort(np.random.default_rng(0).permutation(len(windows))[:len(windows) * 2 * MOST_BLOCKS // blocks])
+
+
+def _busier(windows, sensor, floor, kinds, judged):
+    """
+    Return by how much each window's white noise exceeds that at rest, shape (k, 3).
+
+    By kind, from second differences of the windows `judged` (mask), which suppress causes that vary with the motion; at most
+    the misfit of the kind.
+    """
+    place = SENSORS.index(sensor)
+    found = np.ones((len(windows), 3))
+    own = np.array([window.noise_sd[place]**2 if len(window) > 8 else np.full(3, np.nan) for window in windows])
+    still = np.nanmedian(own[judged & (kinds == 'static')], axis=0) if np.any(judged & (kinds == 'static')) else floor.white_variance
+    still = np.maximum(still, LEAST_NOISE[sensor]**2)
+    for kind in np.unique(kinds[kinds != 'static']):
+        most = np.maximum(floor.row_variance(kind) / floor.low_variance, 1.0)
+        found[kinds == kind] = np.clip(np.nanmedian(own[judged & (kinds == kind)], axis=0) / still, 1.0, most)
+    return found
+
+
+def residuals(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return sensor -> residual of every sample of all windows at some values, shape (n, 3): rows within blocks would be too coarse."""
+    parts = [_residuals(group, table, model, values) for group in chunks(windows)]   # columns take many times the memory of their samples
+    return {sensor: np.concatenate([part[sensor] for part in parts]) for sensor in SENSORS}
+
+
+def _residuals(windows, table, model, values):
+    motion, temperature, rows = all_samples(windows)
+    predicted = predict(model, values, table, motion=motion, temperature_c=temperature)
+    outputs = (np.concatenate([w.force_s for w in windows]), np.concatenate([w.rate_s for w in windows]))
+    return {sensor: output - made[rows] for sensor, output, made in zip(SENSORS, outputs, predicted)}
+
+
+def _block_means(attempt, table, motion, temperature, starts):
+    """Return sensor -> means of all columns over the blocks, shape (b, p): some blocks at a time, as their columns need much memory."""
+    recording, found, edges = attempt.recording, {sensor: [] for sensor in SENSORS}, np.append(starts, len(motion))
+    for first in range(0, len(starts), AT_A_TIME):
+        own = edges[first:first + AT_A_TIME + 1]
+        rows = slice(own[0], own[-1])
+        warmth = None if temperature is None else temperature[rows]
+        references = References(recording.model, table, motion.select(rows), temperature_c=warmth)
+        for sensor in SENSORS:
+            taken = [columns(recording.model, sensor, table, motion=references.motion, temperature_c=warmth, references=references),
+                     *(entry.columns(references.at(sensor)) for entry in recording.bank[sensor])]
+            found[sensor].append(_means(np.concatenate(taken, axis=1), own[:-1] - own[0]))
+    return {sensor: np.concatenate(parts) for sensor, parts in found.items()}
+
+
+def _means(rows, starts):
+    """Return means over the blocks that begin at `starts`, shape (b, ...)."""
+    counts = np.diff(np.append(starts, len(rows)))
+    return np.add.reduceat(rows, starts, axis=0) / counts.reshape(-1, *[1] * (rows.ndim - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """A window cut into blocks."""
+
+    edges: np.ndarray
+    """First sample of each block, and the number of samples."""
+    rows: np.ndarray
+    """Rows of the motion in use."""
+    per_block: np.ndarray
+    """Number of them in each block."""
+
+    @property
+    def count(self):
+        return np.diff(self.edges).astype(float)
+
+    def means(self, samples):
+        return np.add.reduceat(samples, self.edges[:-1], axis=0) / self.count.reshape(-1, *[1] * (samples.ndim - 1))
+
+    def of_rows(self, samples):
+        return samples[self.rows] if len(self.rows) > 1 else samples.mean(keepdims=True)
+
+
+def _cut(window, length):
+    size = len(window)
+    if len(window.motion) == 1:
+        return _Cut(np.array([0, size]), np.array([0]), np.array([1]))
+    edges = np.unique(np.linspace(0, size, max(1, round((window.time[-1] - window.time[0]) / length)) + 1).round().astype(int))
+    rows = [np.unique((a + (np.arange(WITHIN) + 0.5) / WITHIN * (b - a)).astype(int)) for a, b in zip(edges, edges[1:])]
+    return _Cut(edges, np.concatenate(rows), np.array([len(part) for part in rows]))

@@ -1,0 +1,172 @@
+"""The residual after the test of every effect: its size, its correlation, and its regimes in the session."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.core.distributions import f_sf
+from imu_calibration.effects.base import AXES, SENSORS, Role
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.explained_share import Explained
+from imu_calibration.selection.questions import Question
+
+SIGNIFICANT = 5.0
+"""Standard deviations above noise from which a rest is significant."""
+LEAST_WINDOWS = 12
+"""Least number of windows; with fewer the model hardly predicts held-out windows."""
+WITHIN_SHARE = 0.02
+"""Least excess of the variance within windows that counts."""
+ALPHA = 1e-4
+"""Significance that a correlation must have."""
+
+
+@dataclass(frozen=True, eq=False)
+class Unexplained:
+    """Structure of one sensor's residual that no effect explains."""
+
+    significant: bool
+    """Whether it is significant against noise and plausible bias processes."""
+    rms: float
+    """Rms beyond noise, m/s^2 or rad/s (but see `unit`): of the windows' means, or within windows where only that is significant."""
+    sigma: float
+    """Standard deviations by which it exceeds noise."""
+    correlates_with: str | None
+    """Variable of the largest correlation, or None."""
+    share: float
+    """Share of the windows' variance explained by it."""
+    where: str | None
+    """Where in the session most of it sits."""
+    residual: np.ndarray
+    """Residual of the windows' means, shape (k, 3)."""
+    noise_sd: np.ndarray
+    """Expected sd from noise, shape (k, 3)."""
+    unit: str | None = None
+    """Unit of `rms` where it is not the sensor's: 'rad/turn' where turns by hand have the largest residual."""
+    axes: tuple = ()
+    """Axes of the sensor that carry it, the strongest first."""
+    regimes: tuple = ()
+    """Conditions under which it appears (`beyond.regimes.RestRegime`), at most one for each axis."""
+    proposal: Any = None
+    """Formula that it follows (`beyond.proposals.Proposal`), or None."""
+    tones: tuple = ()
+    """Fixed frequencies and fixed multiples of a joint's speed in it (`beyond.spectrum.Tone`), the surest first."""
+
+
+def unexplained(attempt: Attempt, explained: Explained, chosen: Sequence[Question]) -> dict[str, Unexplained]:
+    """Return sensor -> Unexplained for a choice of effects."""
+    excess, used = explained.excess(chosen), attempt.search.used(chosen)
+    values = attempt.space.reduced(used, attempt.evidence.fit(used)[0])
+    return {sensor: _rest(attempt, explained, sensor, excess[sensor], values) for sensor in SENSORS}
+
+
+def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dict[str, float]]:
+    """
+    Return bias -> its possible error, for each axis with a significant residual.
+
+    A different offset in half of the windows scatters their means by as much as it shifts the bias. Which half is
+    correct is unknown, for any number of windows.
+    """
+    found = []
+    for sensor, rest in rests.items():
+        if rest.significant:
+            names = model.param_names[model.part(sensor, Role.OFFSET)]
+            scatter = np.sqrt(np.maximum(np.mean(rest.residual**2 - rest.noise_sd**2, axis=0), 0.0))
+            found += [{names[k]: float(scatter[k])} for k in map(AXES.index, rest.axes)]
+    return found
+
+
+def _rest(attempt, explained, sensor, excess, values):
+    space, recording = attempt.space, attempt.recording
+    residual = np.stack([space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1)
+    floor = explained.floor.noise[sensor]
+    white = floor.variance_beside_bias(recording.kind, recording.count, recording.duration, keys=recording.keys)
+    noise_sd = np.sqrt(white + floor.bias_variance)
+    sigma_means, sigma_within = explained.sigma(excess)
+    # Quiet axes dilute the excess of one.
+    means, within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
+    sigma = max(sigma_means, sigma_within) if within > WITHIN_SHARE * explained.n_within else sigma_means
+    rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
+    significant = bool(sigma > SIGNIFICANT and explained.n_means >= 3 * LEAST_WINDOWS)
+    if not significant:
+        return Unexplained(False, rms, float(sigma), None, 0.0, None, residual, noise_sd)
+    if sigma_means <= SIGNIFICANT:
+        inside = np.mean([floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])])
+        return Unexplained(True, float(np.sqrt(inside * within / explained.n_within)), float(sigma), None, 0.0, None, residual, noise_sd)
+    if rms == 0:   # less than biases may wander, and more than neighbours may differ
+        rms = float(np.sqrt(np.mean(white) * means / explained.n_means))
+    name, share = correlate(_explanations(recording), residual / noise_sd)
+    return Unexplained(True, rms, float(sigma), name, share, where_most(recording.time, residual, noise_sd), residual, noise_sd)
+
+
+def correlate(explanations: Iterator, residual: np.ndarray) -> tuple[str | None, float]:
+    """
+    Return (name, adjusted share of the variance) of the variable with the largest correlation, or (None, 0).
+
+    `explanations` are (name, columns (k, m), mask of the windows where they are known).
+    """
+    best = (None, 0.0)
+    for name, columns, rows in explanations:
+        if rows.sum() < 3 * columns.shape[1] + 6:
+            continue
+        design = np.column_stack([np.ones(rows.sum()), columns[rows]])
+        left = residual[rows]
+        fitted = design @ np.linalg.lstsq(design, left, rcond=1e-9)[0]
+        total, rest = ((left - left.mean(axis=0))**2).sum(), ((left - fitted)**2).sum()
+        k, n = columns.shape[1], rows.sum()
+        share = 1 - (rest / (n - k - 1)) / (total / (n - 1))
+        layers = residual.shape[1]
+        p_value = f_sf((total - rest) / k / max(rest / (n - k - 1), 1e-300), layers * k, layers * (n - k - 1))
+        if p_value < ALPHA and share > max(best[1], 0.15):
+            best = (name, float(share))
+    return best
+
+
+def _explanations(recording):
+    """Yield (name, columns (k, m), windows where they are known)."""
+    describe, every = recording.describe, np.ones(len(recording.kind), bool)
+    yield from slow_explanations(describe['time'], describe['temperature'])
+    yield 'rate', np.stack([describe['rate'], describe['rate']**2], axis=1), every
+    yield 'specific force', (describe['specific force'] - 9.8)[:, None], every
+    for name in describe:
+        if name.startswith('angle'):
+            number = name[len('angle'):]
+            angle, known = describe[name], describe['span' + number] < 0.7
+            turns = np.stack([w(m * angle) for m in (1, 2, 3) for w in (np.cos, np.sin)], axis=1)
+            yield f'angle of {recording.model.joint_names[int(number)]}', turns, known
+    yield 'motion (moving windows against windows at rest)', recording.moving[:, None].astype(float), every
+
+
+def slow_explanations(time: np.ndarray, temperature: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield (name, columns, mask) of time, steps in time, and temperature where it is known and changes."""
+    every = np.ones(len(time), bool)
+    time = (time - time.mean()) / max(np.ptp(time), 1e-9)
+    yield 'time', np.stack([time, time**2, time**3], axis=1), every
+    yield 'time', _step(time), every
+    if np.all(np.isfinite(temperature)) and np.ptp(temperature) > 0.5:
+        warm = (temperature - temperature.mean()) / np.ptp(temperature)
+        yield 'temperature', np.stack([warm, warm**2], axis=1), every
+
+
+def _step(time):
+    return np.stack([time > level for level in np.quantile(time, (0.2, 0.35, 0.5, 0.65, 0.8))], axis=1).astype(float)
+
+
+def where_most(time: np.ndarray, residual: np.ndarray, noise_sd: np.ndarray) -> str | None:
+    """Return a sentence about the shortest stretch that holds four fifths of the rest, or None when it is everywhere."""
+    order = np.argsort(time)
+    weight = np.maximum(((residual / noise_sd)**2 - 1).sum(axis=1)[order], 0.0)
+    sums = np.concatenate([[0.0], np.cumsum(weight)])
+    if sums[-1] <= 0:
+        return None
+    stop = np.searchsorted(sums, sums[:-1] + 0.8 * sums[-1])
+    time = time[order]
+    known = np.flatnonzero(stop <= len(time))
+    lengths = time[np.minimum(stop[known] - 1, len(time) - 1)] - time[known]
+    first = known[int(np.argmin(lengths))]
+    if lengths.min() > 0.6 * np.ptp(time):
+        return None
+    start, end = f'{time[first]:.0f}', f'{time[stop[first] - 1]:.0f}'
+    return f'four fifths of it lie between {start} s and {end} s' if start != end else f'four fifths of it lie in one window at {start} s'
