@@ -29,14 +29,14 @@ FEW = ('accel_quadratic', 'accel_cubic', 'accel_bias_drift', 'gyro_g_sensitivity
 
 
 @pytest.fixture(scope='module')
-def few_candidates():
-    """Restrict the candidate effects of each search on a table to `FEW`, for tests of other things: it takes a third of the time."""
+def few_candidates(request):
+    """Restrict the candidate effects of each search on a table to `FEW` of the module or of this file: it takes a third of the time."""
     from imu_calibration.selection import investigation
-    every = investigation.testable_effects
+    every, names = investigation.testable_effects, getattr(request.module, 'FEW', FEW)
 
     def few(*arguments):
         effects, not_testable = every(*arguments)
-        return [effect for effect in effects if effect.name in FEW], not_testable
+        return [effect for effect in effects if effect.name in names], not_testable
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(investigation, 'testable_effects', few)
         yield

@@ -241,11 +241,11 @@ def scaled(terms: dict[tuple[str, ...], float], factor: float) -> dict[tuple[str
 def _multiplied(left, right):
     if len(left) * len(right) > MOST_PRODUCTS:
         raise InputError(f'a column must have at most {MOST_PRODUCTS} products when it is multiplied out, this one has more; '
-                         'write it shorter')
+                         'write it shorter', code='column_expands')
     result = added(*({tuple(sorted(a + b)): x * y} for a, x in left.items() for b, y in right.items()))
     if sum(len(factor) for factors in result for factor in factors) > LONGEST_EXPANDED:
         raise InputError(f'a column must have at most {LONGEST_EXPANDED} characters when it is multiplied out, this one has more; '
-                         'write it without powers inside of powers')
+                         'write it without powers inside of powers', code='column_expands')
     return result
 
 

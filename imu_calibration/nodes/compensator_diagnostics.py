@@ -163,7 +163,7 @@ class CompensatorDiagnostics:
     def _values(self):
         node, adopted = self._node, self._node.adopted
         values = {'calibration': adopted.version if adopted else 'none', 'source': adopted.source if adopted else '',
-                  'adopt': node.settings.adopt,
+                  'adopt': node.settings.adopt, 'refused': node.refusal,
                   'loop': 'wait set' if node.by_wait_set else 'public executor', 'input': node.imu.source(),
                   'passed or held back without calibration': node.uncorrected}
         if adopted is None:

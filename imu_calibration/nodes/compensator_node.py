@@ -55,7 +55,7 @@ class CompensatorNode(Node):
         self._current: LiveCompensation | None = None
         self._wanted: LiveCompensation | None = None
         self._told: Adopted | None = None
-        self.problem, self.corrected_already, self._heard, self.awaited = '', '', '', ''
+        self.problem, self.refusal, self.corrected_already, self._heard, self.awaited = '', '', '', '', ''
         announce(self, ['imu/data_raw', 'imu/calibration', 'imu/temperature'], ['imu/data_corrected'])
         self._frames = StaticFrames(self, self._guarded(self._on_transforms))
         self.uncorrected = 0
@@ -182,8 +182,8 @@ class CompensatorNode(Node):
     def _put_in_force(self, adopted: Adopted) -> None:
         if self.adopted is not None and self.adopted.version != adopted.version:
             self._previous = self.adopted
-        self.adopted, self.problem, self._wanted = adopted, '', adopted.compensation
-        self.awaited = ''
+        self.adopted, self.problem, self.refusal, self.awaited = adopted, '', '', ''
+        self._wanted = adopted.compensation
         if self.temperature is None and (adopted.compensation.needs_temperature
                                          or adopted.calibration.conditions.get('temperature_range_c')):
             self.temperature = MatchedInput(self, Temperature, 'imu/temperature', callback=self._guarded(self._on_temperature), depth=10,
@@ -198,7 +198,7 @@ class CompensatorNode(Node):
 
     def _take_topic(self, settings: CompensatorSettings) -> None:
         if version_of(self._heard) == self._harmful:
-            raise DocumentError(f'calibration {self._harmful} increased the error at rest; calibrate again')
+            raise DocumentError(f'calibration {self._harmful} increased the error at rest; calibrate again', code='increased_error')
         self._adopt(self._heard, self._topic, settings)
 
     def _load_file(self, settings: CompensatorSettings) -> None:
@@ -217,6 +217,7 @@ class CompensatorNode(Node):
             return f'waiting for {awaited}'
         except ImuCalibrationError as error:
             why = error.told(HINTS['compensator_node'])
+            self.refusal = error.code
         self.problem = f'the calibration from {source} was refused: {why}'
         self.diagnostics.publish_now()
         return why

@@ -57,6 +57,6 @@ class StaticFrames:
                 from tf2_msgs.msg import TFMessage
             except ImportError as error:
                 raise InputError(f'{TOPIC} needs the messages of the package tf2_msgs, which is not installed; '
-                                 'install ros-jazzy-tf2-msgs, or give target_xyz and target_rpy') from error
+                                 'install ros-jazzy-tf2-msgs, or give target_xyz and target_rpy', code='package_missing') from error
             qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             self._subscription = self._node.create_subscription(TFMessage, TOPIC, self.take, qos)

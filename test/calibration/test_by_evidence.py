@@ -36,6 +36,7 @@ TABLE = Table.from_mapping(TABLES['three_axis'])
 NAMES = tuple(TABLE.joint_names)
 OFFSET = 'reference.time_offset.offset'
 SHAFT = {'table': 'shaft', 'profile': 'sweeps'}
+pytestmark = pytest.mark.usefixtures('few_candidates')
 
 
 @pytest.fixture(scope='module')

@@ -62,7 +62,7 @@ def test_hidden_effect_is_the_first_finding_with_honest_parameters(effect, sizes
 
 
 def test_cause_outside_the_catalogue_is_unexplained_and_not_named():
-    recording = record(SEED, {'angle_bias_accel': None}, 'realistic', through_bag=False)
+    recording = record(SEED, {'angle_bias_accel': None}, 'realistic', through_bag=False, profile='quick')
     diagnosis = diagnose(recording.windows, recording.table, recording.model)
     assert diagnosis.findings == ()
     assert diagnosis.unexplained['accelerometer'].significant

@@ -57,7 +57,7 @@ def responding():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize('name', sorted(HIDDEN))
+@pytest.mark.parametrize('name', ['accel_bias_drift', 'accel_quadratic', 'gyro_bias_drift', 'gyro_g_sensitivity'])
 def test_a_hidden_effect_is_found_and_its_gain_measured(name, responding):
     found = (responding if name == 'gyro_g_sensitivity' else diagnosed(31, HIDDEN[name])).diagnosis
     assert found.findings, [(c.effect, c.gain_alone, c.p_value_alone, c.verdict) for c in found.candidates[:4]]
@@ -137,10 +137,10 @@ def test_the_turns_tell_apart_what_is_one_to_the_norm():
 
 @pytest.mark.long
 def test_nothing_hidden_nothing_found():
-    """Poses and biases that scatter from pose to pose are no effect: at most one finding in 14 recordings (none in 24 during development)."""
-    named = [[f.effect for f in diagnosed(seed, pose_sd=0.002, drift_sd=2e-4, n_poses=20).diagnosis.findings] for seed in range(40, 54)]
+    """Poses and biases that scatter from pose to pose are no effect: no finding in five recordings (none in 24 during development)."""
+    named = [[f.effect for f in diagnosed(seed, pose_sd=0.002, drift_sd=2e-4, n_poses=20).diagnosis.findings] for seed in range(40, 45)]
     print(f'findings where nothing is hidden: {named}')
-    assert sum(map(bool, named)) <= 1
+    assert not any(named)
 
 
 def test_a_cause_that_no_catalogue_holds_is_unexplained():

@@ -17,7 +17,7 @@ WORSE = 1.05
 @pytest.mark.long
 @pytest.mark.parametrize(('cause', 'world'), [
     ('driver_lag', {'table': 'shaft', 'profile': 'sweeps'}), ('motor_ripple', {'table': 'shaft', 'profile': 'sweeps'}),
-    ('flexible_mount', {}), ('backlash', {}), ('stamp_bursts', {}),
+    ('backlash', {}),
 ], ids=lambda value: value if isinstance(value, str) else value.get('table', 'gimbals'))
 def test_what_is_handed_over_helps_in_another_session(cause, world):
     pair = make_pair(cause, 21, **world)

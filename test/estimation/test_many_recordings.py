@@ -93,13 +93,13 @@ def test_biases_that_agree_stay_one(motion):
 @pytest.mark.long
 def test_standard_deviations_hold_when_biases_differ(motion):
     """
-    Errors against the mean of all possible recordings, in reported sd, over 40 sets of four recordings.
+    Errors against the mean of all possible recordings, in reported sd, over 16 sets of four recordings.
 
-    The square of a t-distributed error has a heavy tail (nine degrees of freedom): 120 of them have a mean of 1 with a standard
-    deviation of 0.18 at most.
+    The square of a t-distributed error has a heavy tail (nine degrees of freedom): 96 of them have a mean of 1 with a standard
+    deviation of 0.2 at most, 400 of a normal distribution one of 0.07.
     """
     sds, errors = bias_sds(motion), []
-    for seed in range(40):
+    for seed in range(16):
         rng, values = np.random.default_rng([seed, 2]), random_values(MODEL, 'industrial', seed)
         steps = [{s: rng.normal(0, 5 * sds[s].mean(), 3) for s in SENSORS} for _ in range(4)]
         solution = solve(recordings(motion, values, steps, rng), MODEL)
@@ -107,7 +107,7 @@ def test_standard_deviations_hold_when_biases_differ(motion):
     square = np.array(errors)**2
     biases = np.concatenate([np.arange(len(MODEL.param_names))[MODEL.slices[s, 'bias']] for s in SENSORS])
     assert 0.6 < square[:, biases].mean() < 1.5
-    assert 0.85 < np.delete(square, biases, axis=1).mean() < 1.15
+    assert 0.8 < np.delete(square, biases, axis=1).mean() < 1.2
 
 
 @pytest.mark.long

@@ -18,6 +18,7 @@ from worlds.hiding import record
 from worlds.physics import make_session
 
 HYSTERESIS = ('accel_thermal_hysteresis', 'gyro_thermal_hysteresis')
+FEW = (*HYSTERESIS, 'accel_thermal_bias', 'gyro_thermal_bias', 'gyro_thermal_scale', 'accel_bias_drift', 'gyro_bias_drift', 'gyro_g_sensitivity')
 SHORT = {'profile': 'random_short', 'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0, 'temperature': 'cycle'}
 
 
@@ -94,6 +95,7 @@ def test_it_is_asked_only_where_the_temperature_turned(cycled):
         assert asked or {entry['why'] for entry in lacking if entry['effect'] in HYSTERESIS} == {'the temperature did not reverse: one branch only'}
 
 
+@pytest.mark.usefixtures('few_candidates')
 @pytest.mark.parametrize('hidden', ['accel_thermal_hysteresis', 'gyro_thermal_bias'])
 def test_it_is_found_and_told_from_what_follows_the_temperature(hidden):
     recording = record(21212, {hidden: None}, through_bag=False, temperature='cycle')

@@ -64,30 +64,28 @@ def gathered(bench, node):
 
 def test_a_session_is_told_line_by_line_each_once(bench, session, tmp_path):
     node = start(bench, tmp_path)
-    bench.until(lambda: bench.heard('next: rest in'), 'what is missing next')
+    bench.until(lambda: bench.heard('next: ', level='info'), 'what is missing next')
     send(bench, *session)
     gathered(bench, node)
     answer = bench.call('/calibration_node/solve')
-    assert answer.success and answer.message.startswith('helps (')
-    bench.until(lambda: bench.heard('helps, every parameter is determined; save it with `ros2 service call /calibration_node/save std_srvs/srv/Trigger`'), 'the verdict')
+    assert answer.success and answer.message.startswith('helps ')
+    bench.until(lambda: bench.heard('helps', '`ros2 service call /calibration_node/save std_srvs/srv/Trigger`'), 'the verdict')
     saved = bench.call('/calibration_node/save')
-    assert saved.success and saved.message.startswith('helps: every parameter is determined')
-    assert f'written: {tmp_path}/calibration.yaml and {tmp_path}/calibration.accumulator.npz' in saved.message
+    assert saved.success and saved.message.startswith('helps')
+    assert all(f'{tmp_path}/{name}' in saved.message for name in ('calibration.yaml', 'calibration.accumulator.npz'))
     assert calibration_from_text((tmp_path / 'calibration.yaml').read_text()).decisions == dict.fromkeys(('accelerometer', 'gyroscope'), 'helps')
-    assert bench.heard(f'calibrates on the table {TABLE} with the joints outer, middle, inner; ~/save writes {tmp_path}/calibration.yaml') == 1
-    for words in ('on /imu/data_raw from /tester, reliable', 'on /joint_states from /tester, reliable',
-                  'first window gathered', '~/save: '):
-        assert bench.heard(words) == 1, (words, bench.said)
+    assert bench.heard(TABLE, 'outer, middle, inner', f'{tmp_path}/calibration.yaml', level='info') == 1
+    for values in (('/imu/data_raw', '/tester', 'reliable'), ('/joint_states', '/tester', 'reliable'), ('~/save: ',)):
+        assert bench.heard(*values) == 1, (values, bench.said)
     assert bench.status[CALIBRATION].values and not bench.heard('Traceback')
-    assert bench.heard('--', 'info') == 0   # nobody at a node has options of the command line
+    assert bench.heard('--', level='info') == 0   # nobody at a node has options of the command line
 
 
 def test_topics_that_are_mistyped_are_told_with_the_nearest_of_the_type(bench, session, tmp_path):
     node = start(bench, tmp_path)
     imu, joints = ((kind, bench.node.create_publisher(kind, topic, 10)) for kind, topic in ((Imu, '/imu/data_rwa'), (JointState, '/table/joint_states')))
-    bench.until(lambda: bench.heard('/imu/data_raw (sensor_msgs/msg/Imu): there is /imu/data_rwa; listen to it with '
-                                    '-r imu/data_raw:=/imu/data_rwa', 'warning'), 'the nearest Imu topic')
-    bench.until(lambda: bench.heard('there is /table/joint_states', 'warning'), 'the nearest JointState topic')
+    bench.until(lambda: bench.heard('sensor_msgs/msg/Imu', '-r imu/data_raw:=/imu/data_rwa', level='warning'), 'the nearest Imu topic')
+    bench.until(lambda: bench.heard('-r joint_states:=/table/joint_states', level='warning'), 'the nearest JointState topic')
     bench.until(lambda: bench.lines().get(STREAMS, (0, ''))[0] == ERROR, 'the same on /diagnostics')
     assert imu and joints and not node.worker.state.gathered
 
@@ -97,11 +95,11 @@ def test_a_place_that_cannot_be_written_is_told_at_the_start_and_costs_nothing(b
     (tmp_path / 'file').write_text('here already')
     place = {'a file as parent': tmp_path / 'file' / 'calibration.yaml', 'a name too long': tmp_path / ('x' * 300 + '.yaml')}[kind]
     node = start(bench, tmp_path, save_file=str(place), autosave_period=0.2)
-    bench.until(lambda: bench.heard('saving failed', 'error'), 'the place')
+    bench.until(lambda: bench.heard(place, level='error'), 'the place')
     send(bench, *session)
     gathered(bench, node)
     answer = bench.call('/calibration_node/save')
-    assert not answer.success and 'not written: ' in answer.message and str(place) in answer.message and '\n' not in answer.message
+    assert not answer.success and str(place) in answer.message and '\n' not in answer.message
     bench.until(lambda: bench.lines().get(CALIBRATION, (0, ''))[0] == ERROR, 'an error on /diagnostics')
     assert (tmp_path / 'file').read_text() == 'here already'
     if kind == 'a file as parent':
@@ -129,11 +127,13 @@ def test_at_its_end_unsaved_motion_is_kept_where_a_place_was_given_and_told_lost
     send(bench, *session, ('/other/imu/data_raw', '/other/joint_states'))
     for node in (kept, lost):
         gathered(bench, node)
-    assert f'{tmp_path}/calibration.accumulator.npz; resume:=true' in kept.close()
-    assert "windows were in no file and are lost: call ~/save, or give parameter 'save_file'" in lost.close()
+    told = kept.close()
+    assert f'{tmp_path}/calibration.accumulator.npz' in told and 'resume:=true' in told
+    told = lost.close()
+    assert '~/save' in told and "'save_file'" in told
     again = start(bench, tmp_path, resume=True)
     assert again.worker.live.n_windows >= kept.worker.live.n_windows > 0   # those that were still open count as well
-    assert bench.heard(f'continued with {again.worker.live.n_windows} windows from {tmp_path}/calibration.accumulator.npz') == 1
+    assert bench.heard(f' {again.worker.live.n_windows} ', f'{tmp_path}/calibration.accumulator.npz', level='info') == 1
     kept.close = lost.close = lambda: None
 
 
@@ -145,11 +145,12 @@ def test_motion_of_another_model_or_a_damaged_file_is_put_aside_and_the_session_
     first.close = lambda: None
     other = start(bench, tmp_path, resume=True, accelerometer_model='bias+matrix+accel_quadratic')
     assert other.worker.live.n_windows == 0 and (tmp_path / 'calibration.accumulator.npz.1').is_file()
-    assert bench.heard(f'earlier motion is in {tmp_path}/calibration.accumulator.npz.1', 'error') == 1
+    assert bench.heard(f'{tmp_path}/calibration.accumulator.npz.1', level='error') == 1
     (tmp_path / 'calibration.accumulator.npz').write_bytes(b'damaged')
     assert start(bench, tmp_path, resume=True).worker.live.n_windows == 0
     assert (tmp_path / 'calibration.accumulator.npz.2').read_bytes() == b'damaged'
-    line, = [line for level, line in bench.said if level == 'error' and 'of 7 bytes is damaged' in line]
+    line, = [line for level, line in bench.said if level == 'error' and f'{tmp_path}/calibration.accumulator.npz.2' in line]
+    assert ' 7 ' in line   # bytes
     assert line.count('remove') == 1 and not any(word in line for word in ('pickle', 'Error', 'numpy', 'without resume'))
 
 
@@ -158,9 +159,9 @@ def test_whatever_fails_within_is_told_and_the_session_goes_on(bench, session, t
     live = node.worker.live
     whole, live.push = live.push, lambda block: 1 / 0
     send(bench, *session)
-    bench.until(lambda: bench.heard('take failed and is left out: ZeroDivisionError', 'error'), 'the fault')
+    bench.until(lambda: bench.heard('take', 'ZeroDivisionError', level='error'), 'the fault')
     answer = bench.call('/calibration_node/save')
-    assert not answer.success and 'no file was written' in answer.message
+    assert not answer.success and not list(tmp_path.iterdir())
     live.push = whole
     bench.until(lambda: not node.worker.state.faults, 'that it is over')
     send(bench, *session)
@@ -170,12 +171,13 @@ def test_whatever_fails_within_is_told_and_the_session_goes_on(bench, session, t
 
 def test_parameters_change_while_it_runs_or_say_why_not(bench, tmp_path):
     node = start(bench, tmp_path, setling=1.0)
-    assert "'setling' is unknown and ignored; did you mean 'settling'?" in unknown_parameters(node)[0]
+    line, = unknown_parameters(node)
+    assert "'setling'" in line and "'settling'" in line
     assert node.set_parameters([Parameter('settling', value=2.0)])[0].successful
     assert node._options.windows.settling == 2.0
-    for name, value, words in (('model_as_asked', True, 'gathered for the model'), ('accelerometer_model', 'bias', 'gathered for the model')):
+    for name, value in (('model_as_asked', True), ('accelerometer_model', 'bias')):
         answer = node.set_parameters([Parameter(name, value=value)])[0]
-        assert not answer.successful and 'cannot be changed while the node runs' in answer.reason and words in answer.reason
+        assert not answer.successful and name in answer.reason and node.get_parameter(name).value != value
 
 
 def test_joint_states_without_positions_and_zero_stamps_are_named(bench, session, tmp_path):
@@ -185,8 +187,8 @@ def test_joint_states_without_positions_and_zero_stamps_are_named(bench, session
     bench.until(silent.get_subscription_count, 'a subscription')
     for _ in range(20):
         silent.publish(JointState(name=['outer', 'middle', 'inner']))
-    bench.until(lambda: bench.heard('no message on /joint_states is usable: 20 JointState without a position for every name'), 'the empty position')
-    assert not bench.heard('must name outer, middle, inner')
+    bench.until(lambda: bench.heard('/joint_states', '20 JointState'), 'the empty position')
+    assert not bench.heard('outer, middle, inner', level='warning') and not bench.heard('outer, middle, inner', level='error')
     to = bench.node.create_publisher(Imu, 'imu/data_raw', 1000)
     bench.until(to.get_subscription_count, 'a subscription')
     for message in rows(encode_imu(replace(imu, stamp_ns=np.zeros(len(imu), np.int64)))):

@@ -78,7 +78,7 @@ def check_the_answer(station, live, expected):
     assert_same(live, expected)
     groups = {name: status for name, status in station.status.items() if 'calibration_node: ' in name}
     assert groups['calibration_node: accelerometer bias'].level == b'\0'
-    assert any('still needed' in message for _, _, message in station.history)
+    assert not values_of(station, 'accelerometer bias')['needs'] and any(level == 1 for _, level, _ in station.history)
 
 
 def check_residuals(residuals, live):
@@ -141,12 +141,12 @@ def test_a_hidden_effect_is_named_live(tmp_path):
         station.until(lambda: 'calibration_node: accelerometer accel_quadratic' in station.status, 'its diagnostics')
         group = station.status['calibration_node: accelerometer accel_quadratic']
     assert_same(live, calibration_from_text(calibration_to_text(offline.calibration)))   # the document has the common arm last
-    assert live.statistics['added'] == offline.calibration.statistics['added'] and group.message.startswith('determined')
+    assert live.statistics['added'] == offline.calibration.statistics['added'] and group.level == b'\0'
     print(f'diagnosed live: {status.message}; solve answered after {answered:.1f} s')
     assert first.effect == 'accel_quadratic'
     assert found['outcome'] == 'found' and found['effect'] == first.effect and found['p-value'] == f'{first.p_value:.2g}'
     assert found['held-out reduction'] == f'{first.gain.reduction:.3f}' and found['explanation'] == first.explanation
-    assert status.level == b'\1' and first.explanation in status.message
+    assert status.level == b'\1'
 
 
 @pytest.mark.long
@@ -174,7 +174,7 @@ def check_by_hand(bag, folder, rate, gravity=None):
         node = station.calibration_node(folder, **options)
         station.start('compensator_node')
         station.until(lambda: 'calibration_node: poses' in station.status, 'the first diagnostics')
-        assert 'joint' not in station.status['calibration_node: streams'].message.lower()
+        assert not any('joint' in pair.key for pair in station.status['calibration_node: streams'].values)
         player = station.play(bag, rate, subscribers=2)
         station.until(lambda: player.poll() is not None, 'the end of the recording')
         answer = station.call('/calibration_node/save')
@@ -200,8 +200,7 @@ def check_by_hand(bag, folder, rate, gravity=None):
 def check_the_poses(station, expected):
     """Diagnostics counted up to what the recording holds, and asked for directions on the way."""
     messages = [message for name, _, message in station.history if name == 'calibration_node: poses']
-    assert any('hold it still with' in message and 'not seen yet' in message for message in messages)
-    assert any('at rest for' in message for message in messages)
+    assert len(messages) > expected.statistics['windows']['static']   # one for each change
     windows = expected.statistics['windows']
 
     def counted():
@@ -222,4 +221,4 @@ def resumed(station, node, folder, options, live):
     assert station.call('/calibration_node/reset').success
     station.until(lambda: values_of(station, 'poses').get('poses') == '0', 'no poses after a reset')
     answer = station.call('/calibration_node/solve')
-    assert not answer.success and '4 different attitudes' in answer.message
+    assert not answer.success and '4' in answer.message

@@ -63,14 +63,15 @@ def damaged(before, after):
 
 
 REFUSED = {
-    'unproven': (calibration_to_text(replace(OTHER, proof={}, decision={})), 'accelerometer unproven'),
-    'harms': (calibration_to_text(replace(OTHER, proof=WORSE)), 'accelerometer harms: error'),
-    'scalar noise': (damaged('noise_sd: [', 'noise_sd: 7\n    old: ['), 'noise_sd'),
-    'brackets': ('[' * 200_000, 'YAML|levels'),
-    'aliases': ('a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]', 'aliases'),
-    'another sensor': (damaged('frame_id: imu_link', 'frame_id: other_link'), 'must be for the same sensor'),
-    'huge': ('a: ' + 'x' * 3_000_000, 'more than'),
+    'unproven': (calibration_to_text(replace(OTHER, proof={}, decision={})), 'no_sensor_helps'),
+    'harms': (calibration_to_text(replace(OTHER, proof=WORSE)), 'no_sensor_helps'),
+    'scalar noise': (damaged('noise_sd: [', 'noise_sd: 7\n    old: ['), 'part_value'),
+    'brackets': ('[' * 200_000, 'document_limit'),
+    'aliases': ('a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]', 'yaml_alias'),
+    'another sensor': (damaged('frame_id: imu_link', 'frame_id: other_link'), 'other_sensor'),
+    'huge': ('a: ' + 'x' * 3_000_000, 'document_limit'),
 }
+"""Document and the code of its refusal."""
 
 
 def test_nothing_bad_displaces_what_is_in_force(bench, place):
@@ -78,29 +79,29 @@ def test_nothing_bad_displaces_what_is_in_force(bench, place):
     publisher = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
     bench.until(publisher.get_subscription_count, 'a subscription')
     expected = [node.convert(data, {'source_timestamp': 1}) for data in MESSAGES]
-    for name, (text, words) in REFUSED.items():
+    for name, (text, code) in REFUSED.items():
         bench.status.clear()
+        bench.said.clear()
         publisher.publish(String(data=text))
-        bench.until(lambda: any(word in bench.lines().get(STATUS, (0, ''))[1] for word in words.split('|')), f'the refusal of {name}')
-        level, line = bench.lines()[STATUS]
-        assert level == ERROR and f'{version_of(GOOD_TEXT)} remains in use' in line and '\n' not in line
-        assert bench.heard('was refused', 'error')
+        bench.until(lambda: bench.figure(STATUS, 'refused') == code, f'the refusal of {name}')
+        assert bench.shows(STATUS, version_of(GOOD_TEXT), level=ERROR) and '\n' not in bench.lines()[STATUS][1]
+        assert bench.figure(STATUS, 'calibration') == version_of(GOOD_TEXT)
         assert [node.convert(data, {'source_timestamp': 1}) is None for data in MESSAGES] == [out is None for out in expected]
     publisher.publish(String(data=OTHER_TEXT))
-    bench.until(lambda: bench.lines()[STATUS][1].endswith('(helps)'), 'the good one')
-    assert bench.heard(f'{version_of(OTHER_TEXT)} from topic /imu/calibration (helps) adopted') == 1
+    bench.until(lambda: bench.figure(STATUS, 'decision') == 'helps' and not bench.figure(STATUS, 'refused'), 'the good one')
+    assert bench.heard(version_of(OTHER_TEXT), '/imu/calibration', 'helps', level='info') == 1
     publisher.publish(String(data=OTHER_TEXT + '\n'))   # another document that says the same
     bench.until(lambda: node.adopted.version == version_of(OTHER_TEXT + '\n'), 'the same again')
-    assert bench.heard(') adopted') == 2   # the file's and the other one's
+    assert not bench.heard(version_of(OTHER_TEXT + '\n'), level='info')
     assert node.set_parameters([Parameter('anyway', value=True)])[0].successful
     publisher.publish(String(data=REFUSED['unproven'][0]))
     bench.until(lambda: node.adopted.version == version_of(REFUSED['unproven'][0]), 'the unproven one, with consent')
-    bench.until(lambda: bench.lines()[STATUS][0] == WARN and 'accelerometer unproven' in bench.lines()[STATUS][1], 'a warning all the same')
+    bench.until(lambda: bench.shows(STATUS, 'accelerometer', 'unproven', level=WARN), 'a warning all the same')
     assert node.set_parameters([Parameter('anyway', value=False)])[0].successful
     half = calibration_to_text(replace(OTHER, proof=PROOF | {'accelerometer': WORSE['accelerometer']}))
     publisher.publish(String(data=half))
-    bench.until(lambda: bench.lines()[STATUS][0] == WARN and 'the accelerometer is not corrected' in bench.lines()[STATUS][1], 'a word on the sensor that is left')
-    assert bench.figure(STATUS, 'not corrected') == 'accelerometer' and node.adopted.version == version_of(half)
+    bench.until(lambda: bench.shows(STATUS, 'accelerometer', 'harms', level=WARN) and bench.figure(STATUS, 'not corrected') == 'accelerometer', 'a word on the sensor that is left')
+    assert node.adopted.version == version_of(half)
     answer = bench.call('/compensator_node/reload')
     assert answer.success and version_of(GOOD_TEXT) in answer.message
 
@@ -108,7 +109,7 @@ def test_nothing_bad_displaces_what_is_in_force(bench, place):
 def test_a_file_that_was_named_is_not_displaced_unless_asked(bench, place):
     node = bench.start(CompensatorNode, {'calibration_file': str(place)})
     bench.node.create_publisher(String, 'imu/calibration', latched_qos()).publish(String(data=OTHER_TEXT))
-    bench.until(lambda: bench.heard("was not adopted: parameter 'adopt' is 'file_then_topic'"), 'a word about it')
+    bench.until(lambda: bench.heard('/imu/calibration', 'adopt', 'file_then_topic', level='warning'), 'a word about it')
     assert node.adopted.version == version_of(GOOD_TEXT)
     assert node.set_parameters([Parameter('adopt', value='topic')])[0].successful
     assert node.adopted.version == version_of(OTHER_TEXT)   # what was heard meanwhile
@@ -122,8 +123,8 @@ def test_parameters_change_while_it_runs_or_say_why_not(bench, place, tmp_path):
     def change(**values):
         return node.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
     for values, words in (({'calibration_file': str(tmp_path / 'other.yaml')}, 'read-only'), ({'noise_file': '/dev/zero'}, 'read-only'),
-                          ({'adopt': 'nobody'}, 'must be file, topic, file_then_topic'), ({'public_executor': True}, 'cannot be changed while the node runs'),
-                          ({'target_xyz': [1.0, 0.0, 0.0]}, 'target frame')):
+                          ({'adopt': 'nobody'}, 'file, topic, file_then_topic'), ({'public_executor': True}, 'public_executor'),
+                          ({'target_xyz': [1.0, 0.0, 0.0]}, 'target_frame')):
         answer = change(**values)
         assert not answer.successful and words in answer.reason and '\n' not in answer.reason
         assert node.adopted.version == version_of(GOOD_TEXT)
@@ -131,7 +132,7 @@ def test_parameters_change_while_it_runs_or_say_why_not(bench, place, tmp_path):
     assert bench.call('/compensator_node/reload').success and node.adopted.version == version_of(OTHER_TEXT)
     place.write_text('frame_id: [')
     answer = bench.call('/compensator_node/reload')
-    assert not answer.success and 'must be YAML' in answer.message and node.adopted.version == version_of(OTHER_TEXT)
+    assert not answer.success and node.refusal == 'not_yaml' and node.adopted.version == version_of(OTHER_TEXT)
     assert change(target_frame='base_link', target_xyz=[1.0, 0.0, 0.0]).successful
     assert node.compensation.transfer.frame_id == 'base_link'
 
@@ -139,8 +140,8 @@ def test_parameters_change_while_it_runs_or_say_why_not(bench, place, tmp_path):
 def test_a_misspelt_parameter_is_told(bench):
     node = bench.start(CompensatorNode, {'calibration_fiel': 'a.yaml', 'reliable': True, 'covariance_rate': 2.0})
     lines = unknown_parameters(node)
-    assert len(lines) == 2 and "'calibration_fiel' is unknown and ignored; did you mean 'calibration_file'?" in lines[0]
-    assert "'reliable' is not needed any more" in lines[1]
+    assert len(lines) == 2 and "'calibration_fiel'" in lines[0] and "'calibration_file'" in lines[0]
+    assert "'reliable'" in lines[1]
 
 
 def test_whatever_a_message_does_the_stream_goes_on(bench, place, monkeypatch):
@@ -149,8 +150,8 @@ def test_whatever_a_message_does_the_stream_goes_on(bench, place, monkeypatch):
     monkeypatch.setattr(node.compensation, 'correct', lambda *arguments: 1 / 0)
     assert node.convert(MESSAGES[1], {'source_timestamp': 1}) is None
     monkeypatch.undo()
-    bench.until(lambda: 'failed with ZeroDivisionError' in bench.lines().get(STATUS, (0, ''))[1], 'a word about it')
-    assert bench.lines()[STATUS][0] == ERROR and node.convert(MESSAGES[2], {'source_timestamp': 1}) is not None
+    bench.until(lambda: bench.shows(STATUS, 'ZeroDivisionError', level=ERROR), 'a word about it')
+    assert node.convert(MESSAGES[2], {'source_timestamp': 1}) is not None
 
 
 def test_a_temperature_that_is_nan_or_stops_is_told(bench, tmp_path, monkeypatch):
@@ -161,13 +162,12 @@ def test_a_temperature_that_is_nan_or_stops_is_told(bench, tmp_path, monkeypatch
     publisher = bench.node.create_publisher(Temperature, 'imu/temperature', 10)
     bench.until(publisher.get_subscription_count, 'a subscription')
     node.convert(MESSAGES[0], {'source_timestamp': 1})
-    bench.until(lambda: 'no temperature was received' in bench.lines().get(STATUS, (0, ''))[1], 'that it waits')
+    bench.until(lambda: bench.figure(STATUS, 'no temperature yet') == '1' and bench.shows(STATUS, 'temperature', level=WARN), 'that it waits')
     publisher.publish(Temperature(temperature=float('nan')))
-    bench.until(lambda: 'temperatures on /imu/temperature must be finite' in bench.lines()[STATUS][1], 'NaN')
+    bench.until(lambda: bench.shows(STATUS, '/imu/temperature', 'finite'), 'NaN')
     publisher.publish(Temperature(temperature=28.0))
     bench.until(lambda: node.compensation.dt is not None, 'the temperature')
-    bench.until(lambda: 'the last one, 28.0 C, remains in use' in bench.lines()[STATUS][1], 'that it stopped')
-    assert 'is a publisher but does not send' in bench.lines()[STATUS][1]
+    bench.until(lambda: bench.shows(STATUS, '28.0 C', '/imu/temperature', '/tester'), 'that it stopped')
 
 
 def test_any_publisher_connects_and_two_are_told(bench, place, monkeypatch):
@@ -181,16 +181,16 @@ def test_any_publisher_connects_and_two_are_told(bench, place, monkeypatch):
     best_effort = other.create_publisher(Imu, 'imu/data_raw', QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT))
     bench.until(best_effort.get_subscription_count, 'its subscription')
     assert not node.imu.reliable
-    bench.until(lambda: '2 publishers on /imu/data_raw (/sender, /tester)' in bench.lines().get(STATUS, (0, ''))[1], 'that there are two')
+    bench.until(lambda: bench.shows(STATUS, '2', '/imu/data_raw', '/sender', '/tester', level=WARN), 'that there are two')
     other.destroy_publisher(best_effort)
-    bench.until(lambda: node.imu.reliable and 'publishers on' not in bench.lines()[STATUS][1], 'that it is over')
+    bench.until(lambda: node.imu.reliable and not bench.shows(STATUS, '/sender'), 'that it is over')
 
 
 def test_a_topic_that_is_mistyped_is_told_with_the_nearest(bench, place):
     bench.node.create_publisher(Imu, '/imu/data_rwa', 10)
     bench.start(CompensatorNode, {'calibration_file': str(place)})
-    bench.until(lambda: '-r imu/data_raw:=/imu/data_rwa' in bench.lines().get(STATUS, (0, ''))[1], 'the nearest topic')
-    bench.until(lambda: bench.heard('there is /imu/data_rwa', 'warning'), 'the same on the terminal')
+    bench.until(lambda: bench.shows(STATUS, '-r imu/data_raw:=/imu/data_rwa'), 'the nearest topic')
+    bench.until(lambda: bench.heard('-r imu/data_raw:=/imu/data_rwa', level='warning'), 'the same on the terminal')
 
 
 def test_a_new_calibration_is_no_error(bench, place):
@@ -217,7 +217,7 @@ def test_a_missing_file_ends_the_node_unless_it_is_waited_for(bench, tmp_path, m
     with refused(InputError, 'calibration_missing', str(missing), 'wait_for_file'):
         bench.start(CompensatorNode, {'calibration_file': str(missing)})
     node = bench.start(CompensatorNode, {'calibration_file': str(missing), 'wait_for_file': True}, namespace='patient')
-    bench.until(lambda: bench.heard('waits for the file'), 'the line')
+    bench.until(lambda: bench.heard(missing, level='info'), 'the line')
     assert node.adopted is None
     missing.write_text(GOOD_TEXT)
     bench.until(lambda: node.adopted is not None, 'the calibration')
@@ -229,7 +229,7 @@ def test_the_process_of_a_node_whose_file_is_missing_ends_with_code_1(tmp_path):
         assert process.wait(60) == 1
         station.processes.running.clear()
     lines = (tmp_path / 'out.txt').read_text().splitlines()
-    assert 'reads /imu/data_raw, /imu/calibration, /imu/temperature; publishes /imu/data_corrected' in lines[0]
+    assert all(topic in lines[0] for topic in ('/imu/data_raw', '/imu/calibration', '/imu/temperature', '/imu/data_corrected'))
     assert lines[1].startswith('error: ') and 'none.yaml' in lines[1] and len(lines) == 2
 
 
@@ -242,7 +242,7 @@ def test_a_temperature_in_kelvin_is_refused(bench, tmp_path):
         assert node.diagnostics._temperature == used
         assert node.compensation.dt == (None if used is None else used - thermal.model.temperature_ref_c)
     node.diagnostics.publish_now()
-    assert bench.heard('must be in degrees Celsius, 310.0 is kelvin', 'warning') == 1
+    assert bench.heard('/imu/temperature', '310.0', level='warning') == 1
 
 
 def test_how_the_stamps_are_is_said_at_most_once_a_minute_for_each_state(bench, place, monkeypatch):
@@ -253,7 +253,7 @@ def test_how_the_stamps_are_is_said_at_most_once_a_minute_for_each_state(bench, 
     for second in range(121):
         now[0], slope.line = 1000.0 + second, states[second % 2]
         node.diagnostics._tell_stamps(SimpleNamespace(slope=slope))
-    assert bench.heard(str(states[0]), 'info') == 3 and bench.heard(str(states[1]), 'info') == 2
+    assert bench.heard(states[0], level='info') == 3 and bench.heard(states[1], level='info') == 2
 
 
 def test_while_two_publishers_are_there_nothing_is_adopted_and_then_the_last_word_of_the_one_that_stays(bench):
@@ -265,7 +265,7 @@ def test_while_two_publishers_are_there_nothing_is_adopted_and_then_the_last_wor
     second = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
     bench.until(second.get_subscription_count, 'another subscription')
     second.publish(String(data=OTHER_TEXT))
-    bench.until(lambda: bench.heard('no calibration is adopted', 'warning'), 'the refusal')
+    bench.until(lambda: bench.heard('/imu/calibration', '/tester, /tester', level='warning'), 'the refusal')
     assert node.adopted.version == version_of(GOOD_TEXT)
     bench.node.destroy_publisher(first)
     bench.until(lambda: node.adopted.version == version_of(OTHER_TEXT), 'the one that stays')
@@ -287,7 +287,7 @@ def test_a_calibration_that_harms_at_rest_gives_way_to_the_previous_one(bench, p
     for row in encode_imu(imu):
         node.convert(row.tobytes(), {'source_timestamp': 1})
     bench.until(lambda: node.adopted.version == version_of(GOOD_TEXT), 'the previous one')
-    assert bench.heard('is used again', 'error') == 1
+    assert bench.heard(version_of(harmful), version_of(GOOD_TEXT), level='error') == 1
     publisher.publish(String(data=harmful))
-    bench.until(lambda: 'increased the error at rest' in bench.lines()[STATUS][1], 'the refusal')
+    bench.until(lambda: bench.figure(STATUS, 'refused') == 'increased_error' and bench.shows(STATUS, version_of(harmful), level=ERROR), 'the refusal')
     assert node.adopted.version == version_of(GOOD_TEXT)

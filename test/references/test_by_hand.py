@@ -139,12 +139,12 @@ def test_noise_free_recording_gives_the_truth():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize('seeds, sensitivity', [(60, 0.0), (25, 5e-4)])
+@pytest.mark.parametrize('seeds, sensitivity', [(24, 0.0), (12, 5e-4)])
 def test_reported_sd_are_honest(seeds, sensitivity):
     """
     Random sensors and sessions: normalised squared error near 1, 95 % intervals hold.
 
-    With 21 (30) parameters of which about a third is independent, the mean over 60 seeds scatters by 0.05, over 25 by 0.08; the scatter of
+    With 21 (30) parameters of which about a third is independent, the mean over 24 seeds scatters by 0.08, over 12 by 0.11; the scatter of
     poses comes from some 10 degrees of freedom, which the report makes up for.
     """
     normalised, inside = [], []
@@ -154,8 +154,8 @@ def test_reported_sd_are_honest(seeds, sensitivity):
         normalised.append(error @ np.linalg.solve(covariance, error) / len(error))
         inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(covariance)))
     print(f'mean normalised squared error {np.mean(normalised):.3f}, 95 % intervals hold {100 * np.mean(inside):.1f} %')
-    assert 0.85 < np.mean(normalised) < 1.2
-    assert 0.925 < np.mean(inside) < 0.98
+    assert 0.8 < np.mean(normalised) < 1.3
+    assert 0.91 < np.mean(inside) < 0.985
 
 
 def normalised_errors(seeds, **session):

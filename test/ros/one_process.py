@@ -84,9 +84,14 @@ class OneProcess:
         """Return a value of a status, '' when it is not there."""
         return next((pair.value for pair in self.status[name].values if pair.key == key), '') if name in self.status else ''
 
-    def heard(self, words, level=None):
-        """Return how often a line with those words was said."""
-        return sum(words in line for kind, line in self.said if level in (None, kind))
+    def heard(self, *values, level=None):
+        """Return how many lines hold all of these names, numbers and keys; sentences may change."""
+        return sum(all(str(value) in line for value in values) for kind, line in self.said if level in (None, kind))
+
+    def shows(self, name, *values, level=None):
+        """Return whether the latest status has this level and holds all of these names, numbers and keys."""
+        shown, line = self.lines().get(name, (None, ''))
+        return shown is not None and level in (None, shown) and all(str(value) in line for value in values)
 
     def call(self, name, kind=Trigger, until=None, **fields):
         """Call a service with these fields of its request and return its answer; `until` waits in place of the method."""

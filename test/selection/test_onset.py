@@ -6,24 +6,14 @@ import pytest
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
 from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.effects.base import Role
-from imu_calibration.selection import investigation
 from imu_calibration.selection.investigation import investigate
-from imu_calibration.selection.questions import testable_effects as find_testable_effects
 
 from worlds.hiding import record
 from worlds.moments import Clock, Moment
 
 FEW = ('time_offset', 'clock_rate', 'clock_step', 'encoder_zero', 'table_tilt', 'gyro_g_sensitivity')
 SEED = 6
-
-
-@pytest.fixture
-def few_effects(monkeypatch):
-    """Test few effects: a recording is reduced in less than a second."""
-    def some(*arguments):
-        effects, lacking = find_testable_effects(*arguments)
-        return [effect for effect in effects if effect.name in FEW], lacking
-    monkeypatch.setattr(investigation, 'testable_effects', some)
+pytestmark = pytest.mark.usefixtures('few_candidates')
 
 
 def investigated(cause):
@@ -37,7 +27,7 @@ def moment_of(recording, share):
 
 
 @pytest.mark.parametrize('kind, what', [('axes', 'accelerometer'), ('mount', 'accelerometer and gyroscope'), ('belt', 'encoder_zero')])
-def test_a_change_at_one_moment_is_found_with_both_states(few_effects, kind, what):
+def test_a_change_at_one_moment_is_found_with_both_states(kind, what):
     recording, found = investigated(Moment(kind))
     onset = found.onset
     assert onset.what == what and onset.share > 0.95
@@ -59,18 +49,18 @@ def test_a_change_at_one_moment_is_found_with_both_states(few_effects, kind, wha
 
 
 @pytest.mark.parametrize('cause', [None, Moment('creep')])
-def test_no_change_and_a_gradual_change_are_no_onset(few_effects, cause):
+def test_no_change_and_a_gradual_change_are_no_onset(cause):
     assert investigated(cause)[1].onset is None
 
 
-def test_a_clock_of_another_rate_is_named(few_effects):
+def test_a_clock_of_another_rate_is_named():
     _, found = investigated(Clock(rate=200e-6))
     assert [question.name for question in found.named] == ['clock_rate'] and found.onset is None
     value, = found.attempt.values(found.named)[list(found.named[0].parameters)]
     assert value == pytest.approx(200e-6 / (1 + 200e-6), abs=1e-7)   # stamps run at this rate by themselves
 
 
-def test_a_step_of_the_clock_is_named_with_its_time(few_effects):
+def test_a_step_of_the_clock_is_named_with_its_time():
     recording, found = investigated(Clock(step=8e-3))
     assert [question.name for question in found.named] == ['clock_step'] and found.onset is None
     step, time = found.attempt.values(found.named)[list(found.named[0].parameters)]
