@@ -37,11 +37,11 @@ PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 LANES = $(PY) test/run_lanes.py
 PROCESSES = $(PLUGINS) -n 3
 
-.PHONY: help setup demo live-demo test test-long test-fast mutants lint oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
+.PHONY: help setup demo live-demo test test-long test-all test-fast mutants lint lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
-	@echo 'also: setup, live-demo, test-long, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, fuzz, noise-coverage, hide-and-seek, docs, clean'
+	@echo 'also: setup, live-demo, test-long, test-all, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, fuzz, noise-coverage, hide-and-seek, docs, clean'
 
 setup: $(STAMP)
 
@@ -70,6 +70,10 @@ test: $(STAMP)
 test-long: $(STAMP)
 	$(LANES) long -- $(PROCESSES) --dist load $(TEST_OPTIONS)
 
+# All lanes in one call, where tests of several lanes share what their file makes once.
+test-all: $(STAMP)
+	$(LANES) core live long -- $(PROCESSES) --dist loadfile $(TEST_OPTIONS)
+
 # The core lane: no DDS, no other processes, no browser. Two processes, because no test waits.
 test-fast: $(STAMP)
 	$(LANES) core -- $(PLUGINS) -n 2 --dist loadfile $(TEST_OPTIONS)
@@ -79,11 +83,19 @@ oracles: $(STAMP)
 	@$(PIP) --prefer-binary --constraint $(PINS) --requirement constraints/oracles.txt
 	@$(PIP) --no-deps --requirement constraints/oracles-alone.txt
 
-# Unused names and arguments, line length, docstrings, annotations, size of the product, marker words: less than a minute.
-lint: $(STAMP)-lint
+# Unused names and arguments, line length, docstrings, annotations, size of the product, marker words: less than a minute, half with -j2.
+lint: lint-code lint-types lint-size lint-words
+
+lint-code: $(STAMP)-lint
 	$(VENV)/bin/ruff check .
+
+lint-types: $(STAMP)-lint
 	$(VENV)/bin/mypy
+
+lint-size: $(STAMP)
 	@$(PY) tools/weigh.py
+
+lint-words: $(STAMP)
 	@$(PY) tools/plain.py
 
 $(STAMP)-lint: $(STAMP) constraints/lint.txt
@@ -92,7 +104,7 @@ $(STAMP)-lint: $(STAMP) constraints/lint.txt
 
 # The same tests on the oldest supported versions, those of Ubuntu 24.04; needs Python 3.11.
 test-oldest:
-	$(MAKE) test test-long VENV=.venv-oldest PINS=constraints/oldest.txt JAZZY=
+	$(MAKE) test-all VENV=.venv-oldest PINS=constraints/oldest.txt JAZZY=
 
 # Each fault of test/mutants/declared.py put into a copy of the code, one at a time: which faults does no test notice?
 mutants: $(STAMP)

@@ -193,7 +193,7 @@ def test_a_damaged_description_in_a_recording_is_left_out(tmp_path):
             for data in (b'', b'\0\1', b'\0\1\0\0\xff\xff\xff\x7f', b'\0\1\0\0\xff\xff\xff\xff' + b'x' * 99):
                 writer.write(topic, 1, data)
     refused('calibrate', tmp_path / 'bag', '--imu-link', 'imu_link', '--output', tmp_path / 'out')
-    assert 'must hold the robot description' in refused('inspect', tmp_path / 'bag', '--imu-link', 'imu_link').err
+    assert '/robot_description' in refused('inspect', tmp_path / 'bag', '--imu-link', 'imu_link').err
 
 
 @pytest.mark.parametrize('change', [lambda text: text.replace('float64', 'string'), lambda text: text.replace('float64 x', 'float64[3] x'),

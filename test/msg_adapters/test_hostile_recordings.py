@@ -80,7 +80,7 @@ def test_a_chunk_expands_to_its_declared_size_at_most(tmp_path, compression, dec
 def test_a_compressed_file_is_not_written_out_without_end(tmp_path, name):
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag' / name).write_bytes(zeros(5 << 30))
-    assert 'frames that are accepted' in refused('inspect', tmp_path / 'bag').err
+    assert name in refused('inspect', tmp_path / 'bag').err
 
 
 def test_frames_without_content_do_not_take_quadratic_time(tmp_path):
@@ -139,7 +139,8 @@ ENDLESS = 'WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n)'
 def test_views_and_generated_columns_in_place_of_tables_are_refused(bag, statements):
     os.remove(bag / 'metadata.yaml')
     change_database(bag, *statements)
-    assert 'must be a plain table' in refused('inspect', bag).err
+    printed = refused('inspect', bag).err
+    assert any(f"'{name}'" in printed for name in ('topics', 'messages', 'message_definitions')) and 'columns' in printed
 
 
 @pytest.mark.parametrize('change', ["UPDATE topics SET name = NULL", "UPDATE topics SET name = x'ff00'", "UPDATE topics SET type = x'00'",
@@ -184,17 +185,18 @@ def test_a_definition_with_far_too_many_fields_is_neither_standard_nor_used(last
     definition = doubling(61, last)
     assert limited(is_standard, IMU_TYPE, 'ros2msg', definition).code is False
     ended = limited(refusal_of, definition)
-    assert ('more than 10000 elements' in ended.code) == (last == 'float64 x') and ended.code, ended
+    assert ('10000' in ended.code) == (last == 'float64 x') and ended.code, ended
 
 
 @pytest.mark.parametrize('definition, reason', [
-    ('string[2000000000] x', 'more than 10000 elements'), ('float64[2000000000] x', 'more than 10000 elements'),
-    ('Header[99999] x\n' + SEPARATOR + 'MSG: std_msgs/Header\nuint32 seq\n', 'more than 10000 elements'),
-    ('E[] x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nint32 X=3\n', 'elements without fields'),
-    ('E[4] x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nint32 X=3\n', 'elements without fields'),
-    ('E x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nE x\n', 'contains itself'), ('int32 x\n' * 200_000, 'at most 100000')])
+    ('string[2000000000] x', '10000 '), ('float64[2000000000] x', '10000 '),
+    ('Header[99999] x\n' + SEPARATOR + 'MSG: std_msgs/Header\nuint32 seq\n', '10000 '),
+    ('E[] x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nint32 X=3\n', IMU_TYPE),
+    ('E[4] x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nint32 X=3\n', IMU_TYPE),
+    ('E x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nE x\n', 'sensor_msgs/msg/E'), ('int32 x\n' * 200_000, '100000')])
 def test_definitions_of_endless_messages_are_refused(definition, reason):
-    assert reason in limited(refusal_of, definition).code
+    told = limited(refusal_of, definition).code
+    assert reason in told and ('10000 ' in told) == (reason == '10000 ')
 
 
 def refusal_of(definition):

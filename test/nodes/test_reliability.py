@@ -133,7 +133,7 @@ def check_clock_jump_and_silence(station, publisher, session, folder):
     still = (np.repeat(values[-1:], 250, 0) for values in (imu.force_s, imu.rate_s))
     alone = ImuSamples(last + 20_000_000 * np.arange(1, 251), *still, 'imu_link')
     publisher.send(alone, joints.select(slice(0, 0)), per_second=80)
-    station.until(lambda: station.status['calibration_node: streams'].level == b'\2', 'an error')
+    station.until(lambda: any('JointState' in message for _, level, message in station.history if level == 1), 'a warning')
     live = answer_of(station, folder)
     assert (live.statistics['stream'] | live.statistics['dropped'])['imu clock reset'] == 1
     used = sum(live.statistics['samples_used'].values())

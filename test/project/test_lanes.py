@@ -49,7 +49,7 @@ def test_a_live_test_may_start_a_process():
 def test_only_live_tests_are_repeated(tmp_path, text, code, unstable):
     (tmp_path / 'pytest.ini').write_text('[pytest]\nmarkers =\n    live: x\n    long: x\n')
     (tmp_path / 'test_it.py').write_text(text)
-    done = subprocess.run([sys.executable, TEST / 'run_lanes.py', 'core', 'live', '--', '-n', '1'], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = subprocess.run([sys.executable, TEST / 'run_lanes.py', 'core', 'live', '--', '-n', str(int(unstable))], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert (bool(done.returncode), 'unstable: test_it.py::test_once' in done.stdout) == (bool(code), unstable), done.stdout
     assert not unstable or 'the first failure' in done.stdout.partition('unstable: ')[2]
     assert 'passed' in done.stdout.splitlines()[-1] or code
