@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ros.workspace import build, plain_environment
+from ros.workspace import plain_environment
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
@@ -24,11 +24,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.live]
 
 
 @pytest.fixture(scope='module')
-def workspace(tmp_path_factory):
+def workspace(built):
     """A workspace with this tree built in it."""
-    folder = tmp_path_factory.mktemp('workspace')
-    build(folder)
-    return folder
+    return built
 
 
 @pytest.fixture(scope='module')

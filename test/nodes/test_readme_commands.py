@@ -10,12 +10,13 @@ import time
 import pytest
 
 from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.nodes.parameters import UNKNOWN
 
 from worlds.compensation_cases import random_calibration
 
 pytest.importorskip('rclpy')
 from ros.live_station import STAY_LOCAL, TABLE, free_domain  # noqa: E402
-from ros.workspace import ROOT, build, sourced, with_ros2  # noqa: E402
+from ros.workspace import ROOT, sourced  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.live]
 PATIENCE = 240.0
@@ -52,11 +53,13 @@ def nodes_of(command):
 
 
 @pytest.fixture(scope='module')
-def home(tmp_path_factory):
+def home(tmp_path_factory, built, with_ros2):
     """(A home folder with ws in it, the environment of its shells)."""
     folder = tmp_path_factory.mktemp('home')
-    environment = with_ros2(tmp_path_factory.mktemp('ros2')) | STAY_LOCAL | {'HOME': str(folder), 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
-    build(folder / 'ws')
+    environment = with_ros2 | STAY_LOCAL | {'HOME': str(folder), 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
+    (folder / 'ws').mkdir()
+    for name in ('install', 'src'):
+        (folder / 'ws' / name).symlink_to(built / name)
     shutil.copy(TABLE, folder / 'ws' / 'table.yaml')
     (folder / 'ws' / 'calibration.yaml').write_text(calibration_to_text(random_calibration(1)))
     return folder, environment
@@ -159,13 +162,13 @@ def answered(terminals, command):
 @pytest.mark.long
 def test_three_terminals_calibrate_and_compensate_and_answer(terminals, home):
     simulator, calibrator, compensator = map(terminals, THREE)
-    calibrator.wait('Imu messages are received on /imu/data_raw from /simulator_node', 'JointState messages are received', 'first window gathered')
+    calibrator.wait('/imu/data_raw from /simulator_node', 'JointState .*/simulator_node')
     while not lists(terminals('ros2 node list'), '/calibration_node'):   # the daemon that ros2 starts finds the nodes after a while
         pass
     for command in commands():
         if not starts(command) and PLANNER not in command:
             ask(terminals, command)
-    compensator.wait('calibration [0-9a-f]{12} from topic /imu/calibration|was refused')
+    compensator.wait('[0-9a-f]{12} .*/imu/calibration|/imu/calibration was refused')
     assert 'decision:' in (home[0] / 'ws' / 'calibration.yaml').read_text()
     for terminal in (simulator, calibrator, compensator):
         assert terminal.interrupt() == 0, terminal.shown()
@@ -177,17 +180,17 @@ def test_what_runs_starts_as_printed_and_ends_on_ctrl_c(terminals, command):
     terminal = terminals(command)
     terminal.wait(*(rf'\[{name}\]: ' for name in nodes_of(command)))
     if 'none' in command or 'gravity' in command:
-        terminal.wait('calibrates by hand')
+        terminal.wait('by hand')
     elif 'calibration_node --' in command:
-        terminal.wait('calibrates on the table /.*/table.yaml with the joints outer, middle, inner')
+        terminal.wait('/table.yaml .*outer, middle, inner')
     elif 'calibration.yaml' in command:
-        terminal.wait('calibration [0-9a-f]{12} from .*adopted')
+        terminal.wait('calibration [0-9a-f]{12} ')
     elif 'drive.launch' in command:
         for question in commands():
             if PLANNER in question:
                 ask(terminals, question)
     elif 'bag_player' in command:
-        terminal.wait('plays /.*/sample_session at 10 times its speed: .*/imu/data_raw')
+        terminal.wait('/sample_session .*10 .*/imu/data_raw')
     code = terminal.interrupt()
     assert code == 0, f'{code}\n{terminal.shown()}'
-    assert 'Traceback' not in terminal.shown() and 'unknown and ignored' not in terminal.shown(), terminal.shown()
+    assert 'Traceback' not in terminal.shown() and UNKNOWN not in terminal.shown(), terminal.shown()

@@ -12,7 +12,7 @@ from imu_calibration.cli.parser import VERBS
 
 pytest.importorskip('rclpy')
 from ros.live_station import STAY_LOCAL, free_domain  # noqa: E402
-from ros.workspace import ROOT, build, sourced, with_ros2  # noqa: E402
+from ros.workspace import ROOT, sourced  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.live]
 TABLE = ROOT / 'bags/sample_session/table.yaml'
@@ -53,13 +53,12 @@ rclpy.spin(node)
 
 
 @pytest.fixture(scope='module')
-def place(tmp_path_factory):
+def place(tmp_path_factory, built, with_ros2):
     """(a folder to work in, what runs a line of shell there with `ros2` on PATH)."""
     folder = tmp_path_factory.mktemp('ros2_imu')
-    environment = with_ros2(tmp_path_factory.mktemp('ros2'))
-    build(folder)
+    (folder / 'install').symlink_to(built / 'install')
     domain_id, lock = free_domain()
-    environment |= {**STAY_LOCAL, 'ROS_DOMAIN_ID': str(domain_id)}
+    environment = with_ros2 | STAY_LOCAL | {'ROS_DOMAIN_ID': str(domain_id)}
 
     def shell(line):
         return subprocess.run(sourced(folder, line), cwd=folder, env=environment, capture_output=True, text=True, timeout=180, stdin=subprocess.DEVNULL)

