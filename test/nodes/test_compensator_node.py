@@ -17,12 +17,12 @@ from msg_adapters.encode import encode_imu
 from msg_adapters.imu import FIELDS, parse_imu, patch_imu
 
 from ros.harness import Harness
+from ros.live_station import free_domain
 from worlds.compensation_cases import random_calibration
 
 pytest.importorskip('rclpy')
 pytestmark = pytest.mark.live
 
-DOMAIN = 61
 START_NS = 10**18
 PERIOD_NS = 5_000_000
 CALIBRATION = {name: random_calibration(seed) for seed, name in enumerate('ABCE')}
@@ -66,9 +66,10 @@ def bench(tmp_path_factory):
     folder = tmp_path_factory.mktemp('calibrations')
     for name, text in TEXT.items():
         folder.joinpath(f'{name}.yaml').write_text(text)
-    harness = Harness(DOMAIN)
+    domain_id, lock = free_domain()
+    harness = Harness(domain_id)
     harness.publisher(String, '/late/imu/calibration', latched_qos()).publish(String(data=TEXT['C']))
-    with NodeProcesses(DOMAIN) as processes:
+    with NodeProcesses(domain_id) as processes:
         harness.processes, harness.by_name = processes, {}
         for name, parameters in NODES.items():
             parameters = dict(parameters)
@@ -84,11 +85,12 @@ def bench(tmp_path_factory):
                 harness.publisher(String, f'/{name}/imu/calibration', latched_qos())
         for name in NODES:
             if name != 'twice':
-                harness.wait(lambda: harness.connected(raw(name)), 60.0, f'a subscription of {raw(name)}')
-            harness.wait(lambda: harness.node.count_publishers(corrected(name)) > 0, 20.0, f'a publisher of {corrected(name)}')
+                harness.wait(lambda: harness.connected(raw(name)), what=f'a subscription of {raw(name)}')
+            harness.wait(lambda: harness.node.count_publishers(corrected(name)) > 0, what=f'a publisher of {corrected(name)}')
         harness.spin(1.0)
         yield harness
     harness.close()
+    lock.close()
 
 
 def send(bench, name, messages, rate=400.0):
@@ -105,7 +107,7 @@ def sent_through(bench, name, messages, expected=None):
     before = len(bench.received[corrected(name)])
     expected = len(messages) if expected is None else expected
     send(bench, name, messages)
-    bench.wait(lambda: len(bench.received[corrected(name)]) >= before + expected, 20.0, f'{expected} messages of {name}')
+    bench.wait(lambda: len(bench.received[corrected(name)]) >= before + expected, what=f'{expected} messages of {name}')
     bench.spin(0.1)
     return bench.received[corrected(name)][before:]
 
@@ -124,7 +126,7 @@ def force_of(data):
 
 
 def wait_for_version(bench, name, text):
-    bench.wait(lambda: bench.values(node_name(name)).get('calibration') == version_of(text), 20.0, f'version {version_of(text)} of {name}')
+    bench.wait(lambda: bench.values(node_name(name)).get('calibration') == version_of(text), what=f'version {version_of(text)} of {name}')
 
 
 @pytest.mark.parametrize(('name', 'calibration'), [('own', 'A'), ('public', 'B')])
@@ -270,11 +272,11 @@ def test_a_node_killed_in_the_middle_is_replaced(bench):
     bench.by_name['late'].wait()
     bench.statuses.pop(node_name('late'))
     bench.by_name['late'] = bench.processes.start('compensator_node', namespace='/late')
-    bench.wait(lambda: bench.connected(raw('late'), 2), 60.0, 'the new node beside what is left of the old one')
+    bench.wait(lambda: bench.connected(raw('late'), 2), what='the new node beside what is left of the old one')
     wait_for_version(bench, 'late', TEXT['C'])
     before, number = len(bench.received[corrected('late')]), iter(range(1000))
 
     def came_after_one_more():
         send(bench, 'late', imu_messages(1, next(number)), rate=20.0)
         return len(bench.received[corrected('late')]) > before
-    bench.wait(came_after_one_more, 30.0, 'a corrected message')
+    bench.wait(came_after_one_more, what='a corrected message')

@@ -6,6 +6,9 @@ from collections import defaultdict
 
 from imu_calibration.nodes.processes import local_environment
 
+PATIENCE = 240.0
+"""Seconds after which a wait fails; a busy machine needs some of them."""
+
 
 class Harness:
     """A node in this process, in a DDS domain of its own on this host."""
@@ -43,7 +46,7 @@ class Harness:
         while (left := end - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=left)
 
-    def wait(self, condition, seconds=20.0, what='condition'):
+    def wait(self, condition, seconds=PATIENCE, what='condition'):
         """Take messages until `condition()` holds."""
         end = time.monotonic() + seconds
         while not condition():
@@ -62,7 +65,7 @@ class Harness:
         """Return whether our publisher of `topic` has found its subscribers."""
         return self._publishers[topic].get_subscription_count() >= subscribers
 
-    def call(self, service_type, name, seconds=20.0):
+    def call(self, service_type, name, seconds=PATIENCE):
         """Call a service without arguments and return its response."""
         client = self.node.create_client(service_type, name)
         self.wait(client.service_is_ready, seconds, f'service {name}')

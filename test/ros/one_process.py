@@ -9,9 +9,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from ros.live_station import STAY_LOCAL, free_domain
-
-PATIENCE = 30.0
+from ros.live_station import PATIENCE, STAY_LOCAL, free_domain
 
 
 class Ear:

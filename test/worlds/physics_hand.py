@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.references.gravity.hand_parameters import unpack
 
-from worlds.hand_sessions import GRAVITY, NOMINAL, SENSITIVITY, random_truth, turn_samples
+from worlds.hand_sessions import GRAVITY, SENSITIVITY, random_truth, turn_samples
 
 SETTLES = 0.5
 """Time constant of a grip that gives way, s."""
@@ -116,11 +116,6 @@ def drifting(imu, force=0.0, rate=0.0):
     """The biases of the x axes move steadily by these amounts over the recording, m/s^2 and rad/s."""
     share = (imu.stamp_ns - imu.stamp_ns[0]) / (imu.stamp_ns[-1] - imu.stamp_ns[0])
     return replace(imu, force_s=imu.force_s + np.outer(share, [force, 0, 0]), rate_s=imu.rate_s + np.outer(share, [rate, 0, 0]))
-
-
-def nominal_truth():
-    """The parameters of a sensor without errors."""
-    return NOMINAL.copy()
 
 
 def with_slow_turn(seed, rate=0.03, seconds=4.0, **session):
