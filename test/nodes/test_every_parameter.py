@@ -1,4 +1,4 @@
-"""Every parameter of every node, set from outside: a live one changes, any other one is rejected with the reason."""
+"""Every parameter of every node, set from outside: a live one changes, any other one is rejected with the reason; the first line of each node."""
 
 import pytest
 
@@ -18,6 +18,12 @@ pytestmark = pytest.mark.live
 SAMPLE = ROOT / 'bags' / 'sample_session'
 START = {'simulator_node': {'profile': 'none', 'table_file': TABLE}, 'bag_player_node': {'bag': SAMPLE, 'wait_for_subscribers': 100},
          'planner_node': {'table_file': TABLE}, 'calibration_node': {'table_file': TABLE}, 'compensator_node': {}}
+TOPICS = {
+    'calibration_node': ('/imu/data_raw, /imu/temperature', '/imu/calibration, /imu/residual, /imu/coverage'),
+    'compensator_node': ('/raw, /imu/calibration, /imu/temperature', '/imu/data_corrected'),
+    'planner_node': ('/joint_states, /imu/calibration, /diagnostics', '/joint_trajectory, /imu/coverage'),
+    'simulator_node': ('/joint_trajectory', '/imu/data_raw, /joint_states'), 'bag_player_node': ('/imu/data_raw, /joint_states',)}
+"""What the first line of a node names."""
 SERVICES = {GetParameters: 'get_parameters', SetParameters: 'set_parameters', SetParametersAtomically: 'set_parameters_atomically'}
 NAMED = {'adopt': 'topic', 'calibration_file': str(SAMPLE / 'truth.yaml'), 'target_frame': 'base_link',
          'noise_file': ''}
@@ -56,7 +62,7 @@ def asked(station, kind, node, **fields):
 def test_a_live_parameter_changes_and_any_other_is_rejected_with_the_reason(node, tmp_path):
     items = [item for group in settings_of(node) for item in describe(group)]
     with Station(tmp_path / 'out.txt') as station:
-        station.start(node, START[node])
+        station.start(node, START[node], remappings={'imu/data_raw': '/raw'} if node == 'compensator_node' else {})
         values = {item.name: other_value(item) for item in items} | (
             {'save_file': str(tmp_path / 'other.yaml')} if node == 'calibration_node' else {})
         before = asked(station, GetParameters, node, names=list(values)).values
@@ -67,6 +73,8 @@ def test_a_live_parameter_changes_and_any_other_is_rejected_with_the_reason(node
         after = asked(station, GetParameters, node, names=list(values)).values
         process, = station.processes.running
         assert process.poll() is None
+    first = (tmp_path / 'out.txt').read_text().splitlines()[0]
+    assert all(topics in first for topics in TOPICS[node]), first
     for item, old, new, result in zip(items, before, after, results, strict=True):
         old, new = (parameter_value_to_python(value) for value in (old, new))
         if item.live:

@@ -15,7 +15,7 @@ from imu_calibration.core.settings import describe
 from imu_calibration.nodes.early_end import is_node_process
 from imu_calibration.nodes.parameter_files import settings_of
 
-from ros.live_station import TABLE, Station
+from ros.live_station import TABLE
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.live
@@ -157,22 +157,6 @@ def test_what_cannot_be_published_at_the_end_is_not_printed(name):
     done = subprocess.run([sys.executable, '-c', PUBLISHES, name, *parameters], env=environment(), capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert 'Failed to publish' not in done.stderr + done.stdout and 'Error' not in done.stderr
-
-
-@pytest.mark.parametrize('node, topics', [
-    ('calibration_node', '/imu/data_raw, /imu/temperature; /imu/calibration, /imu/residual, /imu/coverage'),
-    ('compensator_node', '/raw, /imu/calibration, /imu/temperature; /imu/data_corrected'),
-    ('planner_node', '/joint_states, /imu/calibration, /diagnostics; /joint_trajectory, /imu/coverage'),
-    ('simulator_node', '/joint_trajectory; /imu/data_raw, /joint_states'),
-    ('bag_player_node', '/imu/data_raw, /joint_states')])
-def test_the_first_line_names_the_topics(node, topics, tmp_path):
-    with Station(tmp_path / 'out.txt') as station:
-        parameters = {'bag': ROOT / 'bags' / 'sample_session', 'wait_for_subscribers': 100} if node == 'bag_player_node' else {'table_file': TABLE}
-        parameters = {} if node in ('compensator_node', 'calibration_node') else parameters
-        station.start(node, parameters, remappings={'imu/data_raw': '/raw'} if node == 'compensator_node' else {})
-        station.until(lambda: (tmp_path / 'out.txt').read_text().strip(), 'the first line')
-        station.spin_for(0.2)
-    assert all(part in (tmp_path / 'out.txt').read_text().splitlines()[0] for part in topics.split('; '))
 
 
 def test_a_node_without_ros_ends_with_one_line(monkeypatch, capsys):
