@@ -125,7 +125,7 @@ config: $(STAMP)
 
 # Pages that are written from what runs: the targets of exports, the answers with their commands and pictures.
 answers: $(STAMP)
-	@$(PY) -m imu_calibration.document.exports.targets_page
+	@$(PY) -m imu_calibration.document.exports.export
 	@$(PY) examples/answers.py
 
 # Noise identified on 204 simulated records of ten minutes to three hours: intervals and errors, the tables of docs/noise.md; half an hour.

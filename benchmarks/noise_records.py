@@ -19,12 +19,14 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
-from imu_calibration.allan.deviation import averaging_factors, overlapping_allan_variance  # noqa: E402
-from imu_calibration.allan.forms import PROCESSES, fit_form  # noqa: E402
+from imu_calibration.allan.curve import averaging_factors, overlapping_allan_variance  # noqa: E402
 from imu_calibration.allan.moment_fit import Moments, Whitener  # noqa: E402
-from imu_calibration.allan.processes import gauss_markov, mean_covariance  # noqa: E402
-from imu_calibration.allan.scale_covariance import ScaleCovariance  # noqa: E402
-from imu_calibration.allan.terms import TIME, identify_axis  # noqa: E402
+from imu_calibration.allan.processes import (  # noqa: E402
+    ScaleCovariance,  # noqa: E402
+    gauss_markov,
+    mean_covariance,
+)
+from imu_calibration.allan.terms import PROCESSES, TIME, fit_form, identify_axis  # noqa: E402  # noqa: E402
 from imu_calibration.effects.base import SENSORS  # noqa: E402
 from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402
 

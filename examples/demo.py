@@ -10,7 +10,7 @@ from pathlib import Path
 
 from imu_calibration.cli.main import main
 from imu_calibration.cli.show import console
-from imu_calibration.compensation import evaluation
+from imu_calibration.compensation import stream
 from imu_calibration.core.units import error_text, significant
 from imu_calibration.document import files
 from imu_calibration.estimation.status import LACKING
@@ -34,8 +34,8 @@ def run(folder):
     verb('simulate', '--profile', 'navigation', '--seed', 2, '--imu-seed', 5, '--output', second)
     verb('compensate', second, '--calibration', folder / 'calibration.yaml', '--output', folder / 'other_session_corrected')
     table, calibration = files.read_table(second / 'table.yaml'), files.read_calibration(folder / 'calibration.yaml')
-    truth = evaluation.session_truth(source_of(second, joint_names=table.joint_names)(), table)
-    show(evaluation.before_and_after(truth, calibration))
+    truth = stream.session_truth(source_of(second, joint_names=table.joint_names)(), table)
+    show(stream.before_and_after(truth, calibration))
     lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
     print('not determined by this recording: ' + (', '.join(lacking) if lacking else 'nothing; every parameter is within its tolerance'))
     print(f'report: {(folder / "report.html").resolve()}')

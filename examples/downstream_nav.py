@@ -20,11 +20,11 @@ from scipy.spatial.transform import Rotation
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from imu_calibration.compensation.stops import StopDetector  # noqa: E402
+from imu_calibration.compensation.health import StopDetector  # noqa: E402
 from imu_calibration.core.samples import ImuSamples  # noqa: E402
 from imu_calibration.document import files  # noqa: E402
 from imu_calibration.effects.forward_equations import sensor_output  # noqa: E402
-from imu_calibration.kinematics.reference_motion import (
+from imu_calibration.kinematics.rotations import (
     Reference,  # noqa: E402
     align,  # noqa: E402
 )

@@ -3,11 +3,11 @@
 
 import numpy as np
 
-from imu_calibration.core.constants import STANDARD_GRAVITY
 from imu_calibration.core.errors import NotObservableError
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.kinematics import strapdown
 from imu_calibration.papers import zhang2017 as zhang
-from imu_calibration.papers import zhang2017_navigation as zhang_claims
+from imu_calibration.papers import zhang2017 as zhang_claims
 from imu_calibration.papers.zhang2017_joint_fit import (
     DESIGNS,
     arm_errors,

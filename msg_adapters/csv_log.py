@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.core.documents import open_regular
 from imu_calibration.core.errors import InputError, shortened
-from imu_calibration.core.regular_files import open_regular
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, stamps_of
-from imu_calibration.preprocessing.chunks import ChunkSeries
-from imu_calibration.preprocessing.turning import relate_turns
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY
+from imu_calibration.preprocessing.full_scale import relate_turns
+from imu_calibration.preprocessing.scan import ChunkSeries
 
 SUFFIXES = ('.csv', '.tsv', '.txt')
 HEAD_BYTES = 1 << 16

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imu_calibration.preprocessing.message_checks import QUANTITIES, MessageEvidence
+from imu_calibration.preprocessing.recording_evidence import QUANTITIES, MessageEvidence
 from msg_adapters.imu import find_imu_layout
 from msg_adapters.stamps import MessageError
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
+from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from msg_adapters.stamps import NS_PER_S
 
 JOINT_TRAJECTORY_TYPE = 'trajectory_msgs/msg/JointTrajectory'

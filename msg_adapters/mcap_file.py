@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.core.regular_files import open_regular
+from imu_calibration.core.documents import open_regular
 from msg_adapters.compressed import decompress_chunk, largest_content
 from msg_adapters.layout import Packed
 from msg_adapters.mcap_records import (

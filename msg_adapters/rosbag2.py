@@ -9,9 +9,8 @@ from tempfile import mkdtemp
 from typing import Any
 
 from imu_calibration.core import documents
-from imu_calibration.core.documents import parsed
+from imu_calibration.core.documents import open_regular, parsed
 from imu_calibration.core.errors import InputError, shortened
-from imu_calibration.core.regular_files import open_regular
 from msg_adapters.compressed import decompress_file, decompress_message
 from msg_adapters.definitions import TypeDefinition, is_standard, is_standard_name, standard_definition
 from msg_adapters.stamps import clean_name

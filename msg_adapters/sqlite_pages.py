@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imu_calibration.core.regular_files import open_regular
+from imu_calibration.core.documents import open_regular
 
 INTERIOR, LEAF = 0x05, 0x0D
 STRETCH_PAGES = 1024

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
-from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
+from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import DEFAULT_TOPICS, standard_definition
 from msg_adapters.encode import UNKNOWN, encode_imu, encode_joints, encode_temperature, rows

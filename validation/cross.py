@@ -8,7 +8,7 @@ import numpy as np
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import HELPS
-from imu_calibration.effects.lags import FAMILY, total_lags
+from imu_calibration.effects.reference_effects import FAMILY, total_lags
 from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.check import check

@@ -15,9 +15,9 @@ ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
     sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
-from imu_calibration.core.constants import DEG, MILLI_G  # noqa: E402
 from imu_calibration.core.errors import ImuCalibrationError  # noqa: E402
 from imu_calibration.core.samples import SampleBlock  # noqa: E402
+from imu_calibration.core.units import DEG, MILLI_G  # noqa: E402
 from imu_calibration.kinematics.table import Table  # noqa: E402
 from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
 from imu_calibration.use_cases.check import check  # noqa: E402

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import t
 
-from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions
 from validation.ferraris import GRAVITY, RATE_HZ, calibrate_sections, known_turns

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand, gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions
 from validation.hand_peers import imu_calib, imu_tk, turned

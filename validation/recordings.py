@@ -6,8 +6,8 @@ from pathlib import Path
 import yaml
 
 from imu_calibration.calibration.hand_workflow import read_imu
-from imu_calibration.core.constants import STANDARD_GRAVITY
 from imu_calibration.core.samples import NominalScaling
+from imu_calibration.core.units import STANDARD_GRAVITY
 from msg_adapters.bag import open_recording
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -6,15 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration import __version__
-from imu_calibration.allan.curve import AllanCurve, Detrending, RestReader
-from imu_calibration.allan.deviation import averaging_factors
+from imu_calibration.allan.curve import AllanCurve, Detrending, RestReader, averaging_factors
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures, TrendFigure
-from imu_calibration.allan.forms import PROCESSES
 from imu_calibration.allan.moment_fit import Moments, Whitener
-from imu_calibration.allan.processes import RANDOM_WALK, WHITE, NoiseProcess
-from imu_calibration.allan.scale_covariance import ScaleCovariance
+from imu_calibration.allan.processes import RANDOM_WALK, WHITE, NoiseProcess, ScaleCovariance
 from imu_calibration.allan.still_parts import LeftOut, StillPart, Survey, still_parts, survey
-from imu_calibration.allan.terms import DETERMINED, LEAST_SCALES, AxisNoise, identify_axis
+from imu_calibration.allan.terms import DETERMINED, LEAST_SCALES, PROCESSES, AxisNoise, identify_axis
 from imu_calibration.allan.trends import MOST_BLOCKS, AxisTrend, Blocks, TrendSearch
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.core.errors import InputError

@@ -1,9 +1,4 @@
-"""
-The noise processes that an Allan curve is made of, each declared once.
-
-A process is known by the generalised covariance ``G(t)`` of its integral: second differences of the integral are all that an Allan variance
-sees, and their covariance is a fourth difference of G. Coefficients enter G linearly (the squares N^2, K^2, ...).
-"""
+"""Noise processes, their Allan variance, and the covariance between scales."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -93,3 +88,135 @@ def gauss_markov(time: float) -> NoiseProcess:
 
 FLATNESS = (2 * np.log(2) / np.pi)**0.5
 """Deviation of flicker noise over B: 0.664."""
+
+
+SECOND_DIFFERENCE = (1.0, -2.0, 1.0)
+DENSE = np.arange(-36, 37) / 12
+"""Lags around where a difference begins or ends, in units of the shorter averaging time; good to thousandths of a correlation."""
+GROWTH, REACH = 1.5, 64.0
+"""Further lags grow by this factor, up to this many of the longer averaging time."""
+ROUNDING = 1e-14
+"""Share of the terms of a fourth difference below which it is a rounding error."""
+MOST_LENGTHS = 24
+"""Stretches are sorted into this many lengths at most."""
+
+
+class ScaleCovariance:
+    """
+    Expectations and covariances of Allan variances.
+
+    Parameters
+    ----------
+    factors : ndarray of int, shape (n_scales,)
+        Samples per mean.
+    lengths : sequence of int
+        Samples of each stretch.
+    period : float
+        Time between samples, s.
+
+    """
+
+    def __init__(self, factors: np.ndarray, lengths: list[int], period: float):
+        self.factors, self.period = np.asarray(factors, np.int64), period
+        self.tau = self.factors * period
+        self.longest = float(np.max(lengths)) * period
+        self._first, self._second = np.triu_indices(len(self.factors))
+        self._short = self.factors[self._first][:, None].astype(float)
+        self._long = self.factors[self._second][:, None].astype(float)
+        self._lengths = _sorted_lengths(lengths)
+        self._lag = _lags(self._short, self._long, self._lengths[0][-1])
+        self._step = np.diff(self._lag, axis=1)
+        weight = self._share(self._lag)
+        self._weight = 0.5 * (weight[:, 1:] + weight[:, :-1])
+        self._expectations: dict[NoiseProcess, np.ndarray] = {}
+        self._correlations: dict[NoiseProcess, np.ndarray] = {}
+        self._products: dict[tuple[NoiseProcess, NoiseProcess], np.ndarray] = {}
+
+    def expectation(self, process: NoiseProcess) -> np.ndarray:
+        """Return the Allan variances of unit coefficient, shape (n_scales,)."""
+        if process not in self._expectations:
+            self._expectations[process] = allan_variance(process, self.tau)
+        return self._expectations[process]
+
+    def product(self, one: NoiseProcess, other: NoiseProcess) -> np.ndarray:
+        """Return the part of the covariance that is multiplied by the product of two coefficients, shape (n_scales, n_scales)."""
+        if other.lattice:
+            one, other = other, one
+        if (one, other) not in self._products:
+            values = self._sum_at_spikes(other) if one.lattice else self._sum(self._correlation(one), self._correlation(other))
+            matrix = np.zeros((len(self.factors),) * 2)
+            matrix[self._first, self._second] = matrix[self._second, self._first] = values
+            self._products[one, other] = self._products[other, one] = matrix
+        return self._products[one, other]
+
+    def tensor(self, processes: tuple[NoiseProcess, ...]) -> np.ndarray:
+        """Return the products of all pairs, shape (n_processes, n_processes, n_scales, n_scales)."""
+        return np.array([[self.product(one, other) for other in processes] for one in processes])
+
+    def _sum(self, first, second):
+        """Sum products of correlations over integer lags, both interpolated linearly between the available lags: exact for white noise."""
+        (a, b), (c, d) = ((values[:, :-1], values[:, 1:]) for values in (first, second))
+        inside = self._step * (2 * a * c + a * d + b * c + 2 * b * d) / 6
+        corners = (b - a) * (d - c) / (6 * np.maximum(self._step, 1.0))
+        return np.einsum('pg,pg->p', self._weight, inside + corners)
+
+    def _sum_at_spikes(self, other):
+        """Sum products with the correlation of quantisation, which is spikes at nine lags."""
+        total = np.zeros(len(self._first))
+        for i, at_short in enumerate(SECOND_DIFFERENCE):
+            for j, at_long in enumerate(SECOND_DIFFERENCE):
+                lag = i * self._short - j * self._long
+                size = at_short * at_long / (self._short * self._long * self.period**2)
+                total += (size * self._share(lag) * self._evaluate(other, lag))[:, 0]
+        return total
+
+    def _share(self, lag):
+        """Return the number of pairs of terms at distance `lag`, over twice the product of the numbers of terms."""
+        pairs, terms = np.zeros_like(lag), [np.zeros_like(self._short), np.zeros_like(self._long)]
+        for length, number in zip(*self._lengths):
+            here = [np.maximum(length - 2 * factor + 1, 0.0) for factor in (self._short, self._long)]
+            pairs += number * np.maximum(np.minimum(here[0], here[1] - lag) - np.maximum(-lag, 0.0), 0.0) * (here[0] > 0)
+            terms = [total + number * more for total, more in zip(terms, here)]
+        return pairs / (2.0 * terms[0] * terms[1])
+
+    def _correlation(self, process):
+        """Return the covariance of second differences at the lags for a unit coefficient, shape (n_pairs, n_lags)."""
+        if process not in self._correlations:
+            for known in [other for other in self._correlations if other.time]:   # too many to keep for all correlation times
+                del self._correlations[known]
+            self._correlations[process] = self._evaluate(process, self._lag)
+        return self._correlations[process]
+
+    def _evaluate(self, process, lag):
+        total, size = np.zeros(lag.shape), np.zeros(lag.shape)
+        for i, at_short in enumerate(SECOND_DIFFERENCE):
+            for j, at_long in enumerate(SECOND_DIFFERENCE):
+                term = at_short * at_long * process.kernel((lag + j * self._long - i * self._short) * self.period)
+                total += term
+                size += np.abs(term)
+        total[np.abs(total) < ROUNDING * size] = 0.0
+        return total / (self._short * self._long * self.period**2)
+
+
+def _lags(short, long, length):
+    """
+    Return the lags (in samples, integers) at which the correlation of each pair is evaluated, sorted, shape (n_pairs, n_lags).
+
+    Dense where one difference begins or ends inside the other, and where the number of pairs of terms in the longest stretch bends.
+    """
+    far = 3.0 * GROWTH ** np.arange(1, int(np.log(REACH * float((long / short).max())) / np.log(GROWTH)) + 2)
+    local = np.concatenate([-far[::-1], DENSE, far])[None, :] * short
+    local = np.clip(local, -REACH * long, REACH * long)
+    first, last = (np.maximum(length - 2 * factor + 1, 0.0) for factor in (short, long))
+    bends = [share * end for end in (-first, last - first, last) for share in (0.25, 0.5, 1.0)]
+    points = np.concatenate([short - k * long + local for k in range(3)] + bends, axis=1)
+    return np.sort(np.rint(points), axis=1)
+
+
+def _sorted_lengths(lengths):
+    """Return (lengths, numbers): each stretch, or classes of about equal length where there are many."""
+    lengths = np.sort(np.asarray(lengths, float))
+    if len(lengths) <= MOST_LENGTHS:
+        return lengths, np.ones(len(lengths))
+    classes = [*np.array_split(lengths[:-1], MOST_LENGTHS - 1), lengths[-1:]]   # only the longest has terms at the longest scales
+    return np.array([part.mean() for part in classes]), np.array([float(len(part)) for part in classes])

@@ -8,10 +8,9 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 
 from imu_calibration.core.samples import NominalScaling, SampleBlock, runs_of
-from imu_calibration.preprocessing.block_cleaning import BlockCleaner
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.chunks import Chunks, ChunkSeries
-from imu_calibration.preprocessing.rest import still_chunks
+from imu_calibration.preprocessing.scan import Chunks, ChunkSeries, still_chunks
+from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 
 OUTLIER = 8.0
 """Scatter and steps count as motion beyond so many of their usual (robust) deviations from the median."""

@@ -13,11 +13,11 @@ from functools import partial
 
 import numpy as np
 
-from imu_calibration.calibration.model_changes import Demand, ModelChanges
+from imu_calibration.calibration.from_solution import Demand, ModelChanges
 from imu_calibration.calibration.table_calibration import conclude, solve_recordings
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.distributions import chi2_sf
-from imu_calibration.document.plausibility import one_significant
+from imu_calibration.document.calibration import one_significant
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import BARE, SensorModel
 from imu_calibration.estimation.prior import make_prior

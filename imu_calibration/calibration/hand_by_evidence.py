@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from imu_calibration.calibration.model_changes import ModelChanges
-from imu_calibration.document.plausibility import one_significant
+from imu_calibration.calibration.from_solution import ModelChanges
+from imu_calibration.document.calibration import one_significant
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.estimation.covariance_terms import REJECTED, with_term

@@ -7,11 +7,11 @@ import numpy as np
 from imu_calibration.calibration.hand_proof import PER_TURN, TURNS_LEAST, turn_error
 from imu_calibration.calibration.hand_workflow import read_by_hand
 from imu_calibration.calibration.proof import compared
-from imu_calibration.calibration.table_check import CheckResult
+from imu_calibration.calibration.table_calibration import CheckResult
 from imu_calibration.compensation.stream import compensate_readings
-from imu_calibration.core.constants import STANDARD_GRAVITY
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import UNIT
 from imu_calibration.preprocessing.checks import Preflight

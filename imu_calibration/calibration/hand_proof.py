@@ -9,10 +9,10 @@ from imu_calibration.calibration.proof import compared
 from imu_calibration.compensation.compensate import compensate
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.uncorrected import LAST_SHARE, Uncorrected, uncorrected_in_time
-from imu_calibration.effects.applied import applied_values
+from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.estimation.scaled_solve import scaled_lstsq
 from imu_calibration.estimation.status import HELD
-from imu_calibration.kinematics.preintegration import integrate_turn
+from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.references.gravity.equations import COMPONENTS, Poses, TurnData, between_middles, build_system
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_options import ByHandSettings

@@ -8,9 +8,9 @@ from functools import lru_cache
 import numpy as np
 
 from imu_calibration.calibration.coverage import DIRECTIONS
-from imu_calibration.core.constants import DEG
+from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES
-from imu_calibration.kinematics.reference_motion import skew
+from imu_calibration.kinematics.rotations import skew
 from imu_calibration.references.gravity.equations import tangent
 
 HOLD = 3.0

@@ -15,14 +15,14 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, NominalScaling, SampleBlock, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.verdict import judged
-from imu_calibration.effects.applied import centred
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.forward_equations import centred
 from imu_calibration.estimation.covariance_terms import GRAVITY
 from imu_calibration.estimation.status import HELD, reasons_held, statuses, tolerances_of
-from imu_calibration.preprocessing.block_cleaning import BlockCleaner, Watcher
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
+from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, Watcher
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.equations import TurnData
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, with_weak_replaced

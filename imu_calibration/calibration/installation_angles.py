@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.core.samples import NominalScaling
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import Role
 

@@ -5,13 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.calibration import accumulator_state
+from imu_calibration.calibration import collector
 from imu_calibration.calibration.collector import LiveCollector, columns_at, copied
-from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, table_coverage
-from imu_calibration.calibration.effect_states import GroupState, group_states, waiting_groups
-from imu_calibration.calibration.live_snapshot import LiveSnapshot
-from imu_calibration.calibration.model_changes import Demand
-from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SessionStatus, TableSession
+from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, GroupState, group_states, table_coverage, waiting_groups
+from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, LiveSnapshot, SessionStatus, TableSession
 from imu_calibration.calibration.table_calibration import conclude
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import InputError
@@ -61,7 +59,7 @@ class LiveCalibration:
                  saved: bytes | None = None):
         self.table, self.options, self.settings = table, options, settings
         self.earlier: Gathered | None = None
-        self.demand = Demand() if saved is None or options.as_asked else accumulator_state.saved_demand(saved)
+        self.demand = Demand() if saved is None or options.as_asked else collector.saved_demand(saved)
         """Effects added to the requested model."""
         self._asked = choose_model(self.demand.options(options), table)
         self._waiting: list[SampleBlock] = []
@@ -72,7 +70,7 @@ class LiveCalibration:
         """The data of the last solution."""
         self._too_far, self._designs = False, {}
         if saved is not None and self._asked.needs_temperature:
-            self._first_temperature_c = accumulator_state.saved_model(saved).temperature_ref_c
+            self._first_temperature_c = collector.saved_model(saved).temperature_ref_c
             self._begin(self._asked.with_reference_temperature(self._first_temperature_c), saved)
         elif not self._asked.needs_temperature:
             self._begin(self._asked, saved)
@@ -163,7 +161,7 @@ class LiveCalibration:
         return self._completed()
 
     def _begin(self, model, saved=None):
-        self.earlier = None if saved is None else accumulator_state.from_bytes(saved, model)
+        self.earlier = None if saved is None else collector.from_bytes(saved, model)
         session = 0
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
@@ -231,7 +229,7 @@ class LiveCalibration:
 
     def saved(self, pending: bool = False) -> bytes:
         """Return all gathered data as bytes, for another run (see `accumulator_state`)."""
-        return accumulator_state.to_bytes(self.gathered(pending), self._begun().model, self.demand)
+        return collector.to_bytes(self.gathered(pending), self._begun().model, self.demand)
 
     def _begun(self) -> LiveCollector:
         if self._collector is None:

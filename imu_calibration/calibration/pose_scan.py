@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.calibration.effect_states import Progress
+from imu_calibration.calibration.coverage import Progress
 from imu_calibration.calibration.session import SessionStatus
 from imu_calibration.core.errors import with_hint
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.estimation.status import COMMON_SCALE, LACKING
-from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.gravity.equations import Poses
 from imu_calibration.references.gravity.hand_calibration import POSES_FULL, POSES_LEAST

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.effects.applied import Centre, applied_values
 from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
-from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.effects.forward_equations import Centre, applied_values, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.attitudes import one_attitude
 from imu_calibration.estimation.pieces import AXES, PIECE_TIME, Regime

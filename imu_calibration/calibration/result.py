@@ -6,11 +6,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from imu_calibration.core.constants import ARCMIN
 from imu_calibration.core.settings import setting
+from imu_calibration.core.units import ARCMIN
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.decision import HELPS, most_cautious
-from imu_calibration.document.statements import Verdict
+from imu_calibration.document.decision import HELPS, Verdict, most_cautious
 from imu_calibration.document.trust import usage
 from imu_calibration.estimation.status import DETERMINED
 from imu_calibration.preprocessing.window import Window

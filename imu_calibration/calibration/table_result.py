@@ -14,10 +14,17 @@ import numpy as np
 
 from imu_calibration.calibration.proof import nominal_values
 from imu_calibration.calibration.result import CalibrationResult, ErrorBudget, ReferenceErrors, WindowErrors
-from imu_calibration.core.constants import ARCMIN
+from imu_calibration.core.units import ARCMIN
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.columns import References, columns, warped_reference
-from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients, predict, sensor_output
+from imu_calibration.effects.forward_equations import (
+    References,
+    coefficient_jacobian,
+    coefficients,
+    columns,
+    predict,
+    sensor_output,
+    warped_reference,
+)
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.observability import tolerance_scaled_singular_values
@@ -25,8 +32,8 @@ from imu_calibration.estimation.prior import fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.kinematics.chain import tilt
 from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.perturbed_table import tilt
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.held_out import HeldOut, HeldOutBlock

@@ -26,7 +26,7 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.cli.show import console, warn
     from imu_calibration.document import files
     from imu_calibration.use_cases.diagnose import diagnose
-    from imu_calibration.use_cases.foxglove_file import foxglove
+    from imu_calibration.use_cases.view import foxglove
     if options.mcap:
         foxglove()   # before the work, not after it
     arguments.require_place(options, 'diagnose', [options.bag])

@@ -15,7 +15,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Print one paragraph per effect."""
-    from imu_calibration.use_cases.catalogue import effect_rows
+    from imu_calibration.use_cases.choices import effect_rows
     rows = effect_rows(options.catalogue)
     for row in rows:
         print(f'{row["effect"]} ({row["sensor"]}, {row["unit"]}, tolerance {row["tolerance"]:g}, compensation {row["compensation"]})')

@@ -23,9 +23,8 @@ from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.calibration_page import calibration_report
 from imu_calibration.report.page import render
 from imu_calibration.use_cases.choices import topics_of
-from imu_calibration.use_cases.pool import cluster_mapper, jobs_for, process_mapper
 from imu_calibration.use_cases.provenance import provenance_with
-from imu_calibration.use_cases.recordings import Topics, provenance_of, source_of
+from imu_calibration.use_cases.recordings import Topics, cluster_mapper, jobs_for, process_mapper, provenance_of, source_of
 from imu_calibration.use_cases.stand import table_of
 from msg_adapters.storages import suffixes
 

@@ -43,12 +43,12 @@ def run(options: Namespace) -> VerbResult:
 
 def _show(found, rates, folder, names):
     """Print the figures, their remarks, and the figures for filters, in 80 columns."""
-    from imu_calibration.allan import summary
-    for head, rows in groupby(summary.rows(found.figures), lambda row: f'{row.sensor}, {row.title}, {row.unit}'):
+    from imu_calibration.allan import document
+    for head, rows in groupby(document.rows(found.figures), lambda row: f'{row.sensor}, {row.title}, {row.unit}'):
         print(head)
         for row in rows:
             print(f' {row.axis} {row.value:>8}  {row.interval:>17}  {row.status:<10}  {row.note}'.rstrip())
     print()
-    for line in [*summary.lines(found.figures), *summary.filter_lines(found.figures, rates, found.horizon)]:
+    for line in [*document.lines(found.figures), *document.filter_lines(found.figures, rates, found.horizon)]:
         print(fill(line, 80, subsequent_indent='    '))
     print(f'written: {names} in {folder}')

@@ -12,7 +12,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.kinematics.reference_motion import Reference, lever_matrix
+from imu_calibration.kinematics.rotations import Reference, lever_matrix
 
 
 class FittedErrors(Protocol):

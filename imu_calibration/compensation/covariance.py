@@ -9,9 +9,8 @@ from imu_calibration.compensation.compensate import FittedErrors, Transfer, inve
 from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.rate_slope import SlopeError
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.columns import columns_at_point
-from imu_calibration.effects.forward_equations import coefficients_at_point
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.effects.forward_equations import coefficients_at_point, columns_at_point
+from imu_calibration.kinematics.rotations import Reference
 
 STEPS = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-2] * 3)
 """Steps of the central differences in force, rate and derivative of the rate: small against the curvature, large against rounding."""

@@ -13,10 +13,9 @@ import numpy as np
 
 from imu_calibration.compensation.compensate import CONVERGED, ITERATIONS, FittedErrors, Transfer, invertible_values
 from imu_calibration.core.errors import InputError
-from imu_calibration.effects.base import AXES, SENSORS, Role
+from imu_calibration.effects.base import AXES, LEVER, SENSORS, Role
 from imu_calibration.effects.expressions import SCALAR_FUNCTIONS, added, as_text, scaled
 from imu_calibration.effects.forward_equations import coefficients_at_point
-from imu_calibration.effects.regressors import LEVER
 
 SETTLED = 1e-13
 """Sum of the changes in one fixed-point step (m/s^2, rad/s) below which the iteration has converged."""

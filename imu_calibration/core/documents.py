@@ -1,10 +1,18 @@
-"""Documents as YAML text: the calibration, the table, tolerances. The same content gives the same bytes."""
+"""Documents as YAML text (the same content gives the same bytes), and opening of untrusted files: regular ones only, up to a size."""
 
+import io
 import math
+import os
 import re
+import zipfile
 from enum import StrEnum
+from errno import EINVAL
 from functools import cache
-from typing import Any
+from os import PathLike
+from stat import S_ISREG
+from typing import Any, BinaryIO, cast
+
+import numpy as np
 
 from imu_calibration.core.errors import InputError, shortened
 
@@ -156,3 +164,41 @@ def version_of(text: str) -> str:
     """Return twelve characters that change whenever a document does: the beginning of its SHA-256."""
     from hashlib import sha256
     return sha256(text.encode()).hexdigest()[:12]
+
+
+ARRAYS_BASE, ARRAYS_RATIO = 64 << 20, 20
+"""Largest size of arrays: this many bytes, plus this many times their compressed size."""
+
+
+def open_regular(path: str | PathLike[str]) -> BinaryIO:
+    """
+    Open a regular file, or a link to one, for reading; a FIFO would block, and a device may never end.
+
+    Raises
+    ------
+    OSError
+        When it cannot be opened or is not a regular file.
+
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)   # opening a FIFO would wait for its writer
+    if not S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(EINVAL, 'it is not a regular file', str(path))
+    return cast(BinaryIO, os.fdopen(descriptor, 'rb'))
+
+
+def load_arrays(data: bytes) -> Any:
+    """
+    Return the arrays of an .npz archive as a context manager; each is decompressed at its first use.
+
+    Raises
+    ------
+    ValueError, zipfile.BadZipFile
+        If it is no such archive, or its arrays need much more memory than a session.
+
+    """
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        n_bytes, limit = sum(member.file_size for member in archive.infolist()), ARRAYS_BASE + ARRAYS_RATIO * len(data)
+    if n_bytes > limit:
+        raise ValueError(f'its arrays need {n_bytes} bytes, at most {limit} are accepted')
+    return np.load(io.BytesIO(data), allow_pickle=False)

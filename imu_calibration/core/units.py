@@ -1,8 +1,21 @@
-"""Customary units, and as many digits as a standard deviation supports: for printed values, never for arithmetic."""
+"""Constants, and customary units with as many digits as a standard deviation supports: for printed values, never for arithmetic."""
+
+import math
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
+STANDARD_GRAVITY = 9.80665
+"""m/s^2: the g of people's units, never the gravity of a place."""
+STANDARD_GRAVITY_SD = 0.02
+"""Standard deviation of an unknown local gravity, m/s^2."""
+MILLI_G = 1e-3 * STANDARD_GRAVITY
+MICRO_G = 1e-6 * STANDARD_GRAVITY
+HOTTEST_C = 200.0
+"""No IMU works above this temperature; a larger reading is in kelvin, degrees C."""
+DEG = math.pi / 180
+DEG_H = DEG / 3600
+ARCMIN = DEG / 60
+
 
 NOISE = 'noise'
 """The quantity of noise figures, which have the units of data sheets."""

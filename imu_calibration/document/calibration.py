@@ -1,22 +1,21 @@
-"""The calibration of an IMU, estimated from recordings, as a document that users and nodes exchange."""
+"""The calibration: parameters with covariance, statuses, reasons, nominal values and plausible sizes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Any
 
 import numpy as np
 
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.core.units import for_people, with_sd
-from imu_calibration.document.decision import SensorDecision, decide, decisions_text, most_cautious
-from imu_calibration.document.statements import Verdict
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY, for_people, significant, with_sd
+from imu_calibration.document.decision import SensorDecision, Verdict, decide, decisions_text, most_cautious
+from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.covariance_terms import GRAVITY
-from imu_calibration.estimation.status import COMMON_SCALE, FIXED, LACKING, Status
+from imu_calibration.estimation.status import COMMON_SCALE, FIXED, HELD, LACKING, Status
 
 UNKNOWN = 'unknown'
 """Entry of the provenance for the uncertainty of imported values."""
@@ -221,3 +220,135 @@ def as_html(calibration: 'Calibration') -> str:
         return '<tr>' + ''.join(f'<{tag}{s}>{escape(cell)}</{tag}>' for cell, s in zip(cells, style, strict=True)) + '</tr>'
     body = ''.join(row(cells, 'td') for cells in parameter_rows(calibration))
     return f'<table><caption>{escape(summary(calibration))}</caption>{row(HEADINGS, "th")}{body}</table>'
+
+
+READINGS = {'accelerometer': {'force'}, 'gyroscope': {'rate', 'angular acceleration'}}
+"""Sensor -> items of `ColumnGroup.uses` that are computed from its readings to correct the other sensor."""
+
+
+def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibration:
+    """
+    Return a calibration without correction of the given sensors.
+
+    Biases and matrices of these sensors are their priors', with the priors' standard deviations, which the covariances of corrected
+    readings propagate; their other effects, except range limits, are removed. So are corrections of the other sensor that use their
+    readings: a g-sensitivity by the force of a refused accelerometer, lever arms by the rate of a refused gyroscope.
+    """
+    model = calibration.model
+    names = {section: tuple(effect.name for effect in model.effects if effect.sensor == section and _stays(effect, sensors))
+             for section in SECTIONS}
+    small = replace(model, accelerometer=names['accelerometer'], gyroscope=names['gyroscope'], reference=names['reference'])
+    places = np.concatenate([np.arange(part.start, part.stop) for part in map(model.slices.__getitem__, small.slices)])
+    values, covariance = calibration.values[places], calibration.covariance[np.ix_(places, places)]
+    status = [calibration.status[place] for place in places]
+    for effect in small.effects:
+        if effect.sensor in sensors and effect.role is not Role.LIMIT:
+            part = small.slices[effect.key]
+            values[part], status[part] = effect.prior_values(), [HELD] * effect.size
+            covariance[part, :] = covariance[:, part] = 0.0
+            covariance[part, part] = np.diag(effect.prior_sds()**2)
+    return replace(calibration, model=small, values=values, covariance=covariance, status=tuple(status), covariance_terms={},
+                   held_reason={})
+
+
+def _stays(effect, sensors):
+    if effect.sensor in sensors:
+        return effect.role in (Role.OFFSET, Role.LINEAR, Role.LIMIT)
+    return effect.sensor == 'reference' or not any(group.uses & READINGS[sensor] for sensor in sensors for group in effect.groups)
+
+
+MISFIT = 10.0
+"""Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
+LOOSE = 2.0
+"""From this factor on the misfit is worth a note."""
+SHOWN_NAMES = 6
+"""Names listed one by one; of more, the groups are named."""
+HAND_AXES = 'accelerometer_lower_triangular'
+"""The axes of a calibration by hand."""
+
+
+
+
+def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:
+    """Return kind of window -> ratio of the residual variance of the sensor to its noise variance."""
+    chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
+    return {kind: ratio for kind, ratio in chi2.items() if kind != 'means'}
+
+
+def quiet(calibration: Calibration) -> str:
+    """
+    Return the name of the reference that residuals in motion are compared with.
+
+    Without a rest it is their slow part; lags are visible in the fast part.
+    """
+    return 'the noise at rest' if rested(calibration) else 'their slow part (as after a lag or a late clock)'
+
+
+def rested(calibration: Calibration) -> bool:
+    """Return whether a recording on a table has rests, from which the noise is known."""
+    windows = calibration.statistics.get('windows')
+    return windows is None or bool(windows.get('static'))
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in a sentence; of many, the groups with their numbers."""
+    if len(names) <= SHOWN_NAMES:
+        return ', '.join(names)
+    groups = {}
+    for name in names:
+        groups.setdefault(name.rpartition('.')[0], []).append(name.rpartition('.')[2])
+    return ', '.join(f'{group} ({len(members)}: {", ".join(members)})' for group, members in groups.items())
+
+
+LOOK_FOR = {'reference': 'the literature values of tables: check the description of the table, the mount, the stamps'}
+
+ONE = 3.0
+"""Standard deviations by which one coefficient of an effect must differ from its prior for the effect to be added."""
+
+
+def one_significant(distance: np.ndarray, sd: np.ndarray) -> bool:
+    """Return whether one of several coefficients differs from its prior by more than ONE standard deviations."""
+    return bool(np.any(np.abs(distance) > ONE * sd))
+
+
+DIAGONAL = (0.5, 2.0)
+"""Scale factors that an instrument in SI units can have: data sheets promise a few per cent."""
+OFF_DIAGONAL = 0.5
+"""Largest off-diagonal element: axes 30 degrees from orthogonal; the mount is part of the table description."""
+LARGEST_BIAS = {'accelerometer': 16 * STANDARD_GRAVITY, 'gyroscope': 4000 * DEG}
+"""The largest full scales of such sensors, m/s^2 and rad/s."""
+
+
+def beyond_instruments(calibration: Calibration, sensor: str) -> str:
+    """Return which value of a sensor's matrix or bias belongs to no instrument, with the limit; '' where none does."""
+    matrix, bias = (np.asarray(calibration.of(sensor, role)) for role in (Role.LINEAR, Role.OFFSET))
+    diagonal, off = np.diag(matrix), np.abs(matrix - np.diag(np.diag(matrix))).max()
+    for value in (diagonal.min(), diagonal.max()):
+        if not DIAGONAL[0] <= value <= DIAGONAL[1]:
+            return f'a scale factor must be {DIAGONAL[0]:g} to {DIAGONAL[1]:g}, it is {significant(value)}'
+    if off > OFF_DIAGONAL:
+        return f'off-diagonal elements must be at most {OFF_DIAGONAL:g}, the largest is {significant(off)}'
+    if np.abs(bias).max() > LARGEST_BIAS[sensor]:
+        return f'a bias must be within full scale ({significant(LARGEST_BIAS[sensor])} SI), it is {significant(np.abs(bias).max())}'
+    return ''
+
+
+def beyond_known(share: float, section: str) -> str:
+    """Return the message for an effect that explains a share of the excess variance with a size that no known instrument has."""
+    return (f'explains {100 * share:.0f} % of the residual, but its size exceeds '
+            f'{LOOK_FOR.get(section, "the literature values of such sensors: check saturation, the mount, the scale")}')
+
+
+def implausible(calibration: Calibration, sensor: str | None = None) -> list[str]:
+    """Return one line for each parameter group, of one sensor or of all, that is outside the range of all grades of instruments."""
+    lines = []
+    for effect in calibration.model.effects:
+        if sensor not in (None, effect.sensor):
+            continue
+        amplitudes = effect.amplitudes(calibration.values[calibration.model.slices[effect.key]])
+        if effect.surpasses(amplitudes):
+            grade, largest, source = effect.plausible[-1]
+            size = max(map(abs, amplitudes))
+            lines.append(f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, '
+                         f'more than ten times the known values of {grade} instruments ({largest:.3g}; {source}): check units and axes')
+    return lines

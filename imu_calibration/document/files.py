@@ -18,8 +18,8 @@ from typing import Any
 from imu_calibration.allan.document import noise_from_text
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.core import documents
+from imu_calibration.core.documents import open_regular
 from imu_calibration.core.errors import InputError, shortened
-from imu_calibration.core.regular_files import open_regular
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text, checked_tolerances
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue

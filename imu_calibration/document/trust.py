@@ -7,11 +7,8 @@ import numpy as np
 
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.core.errors import DocumentError
-from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration import HAND_AXES, Calibration, beyond_instruments, listed, with_nominal
 from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN, decisions_text, reason_of
-from imu_calibration.document.nominal import with_nominal
-from imu_calibration.document.plausibility import beyond_instruments
-from imu_calibration.document.reasons import HAND_AXES, listed
 from imu_calibration.document.uncorrected import uncorrected_lines
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.status import LACKING

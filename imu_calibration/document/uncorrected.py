@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.units import error_text
-from imu_calibration.effects.applied import Centre, in_time, not_applied
 from imu_calibration.effects.base import UNIT, Effect
-from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.effects.forward_equations import Centre, coefficients, in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.rotations import Reference
 
 END, MEAN = 'end of the recording', 'mean of the recording'
 LAST_SHARE = 2.0 / 3.0

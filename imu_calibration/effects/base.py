@@ -1,4 +1,4 @@
-"""The effect: one physical cause of sensor output, declared once."""
+"""An effect: one physical cause of sensor output, its columns, its coefficients and their derivatives."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,6 +6,8 @@ from enum import Enum, auto
 from typing import Any
 
 import numpy as np
+
+from imu_calibration.effects.expressions import ColumnGroup
 
 AXES = ('x', 'y', 'z')
 SENSORS = ('accelerometer', 'gyroscope')
@@ -54,7 +56,7 @@ class Effect:
     """
     One physical cause of sensor output.
 
-    A *sensor* effect acts on one sensor. It has column groups (`effects.column_group`) and computes, from the values of all
+    A *sensor* effect acts on one sensor. It has column groups (`effects.expressions`) and computes, from the values of all
     parameters of the sensor, the coefficients of these columns, so that ``output = sum(columns @ coefficients)``. Products
     of parameters (matrix times arm) become coefficients of columns of their own; a triangular factor of the columns is
     then an exact summary of the data.
@@ -134,7 +136,7 @@ class Effect:
     nuisance: bool = False
     """Whether it is a nuisance parameter, estimated but not requested."""
     definition: dict | None = None
-    """The plain data that it was made of (`effects.term`), which may travel in documents; None for the catalogue's own."""
+    """The plain data that it was made of (`effects.catalogue`), which may travel in documents; None for the catalogue's own."""
 
     @property
     def key(self) -> tuple[str, str]:
@@ -207,3 +209,162 @@ class Effect:
     def unit_of(self, index: int) -> str:
         """Return the unit of component `index`."""
         return self.unit if isinstance(self.unit, str) else self.unit[index]
+
+
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
+TRIPLES = ((0, 0, 0), (1, 1, 1), (2, 2, 2), (0, 0, 1), (0, 0, 2), (1, 1, 0), (1, 1, 2), (2, 2, 0), (2, 2, 1), (0, 1, 2))
+WARMTH = 'temperature_c - temperature_ref_c'
+INPUT = {'accelerometer': 'force', 'gyroscope': 'rate'}
+_VECTOR = {'accelerometer': [f'f_{a}' for a in AXES], 'gyroscope': [f'w_{a}' for a in AXES]}
+
+
+def _of_input(ending, texts):
+    """Return {sensor: ColumnGroup} made of the components of its true input."""
+    return {sensor: ColumnGroup(INPUT[sensor] + ending, tuple(texts(_VECTOR[sensor]))) for sensor in SENSORS}
+
+
+ONE = ColumnGroup('one', ('1',))
+TRUE_INPUT = _of_input('', lambda v: v)
+SQUARES = _of_input('_squares', lambda v: [f'{v[j]} * {v[k]}' for j, k in PAIRS])
+CUBES = _of_input('_cubes', lambda v: [f'{v[i]} * {v[j]} * {v[k]}' for i, j, k in TRIPLES])
+SIGNED = _of_input('_signed', lambda v: [f'sign({vi}) * {vj}' for vi in v for vj in v])
+"""Column 3 i + j: |u.v| for an input axis u close to axis i is sign(v_i) (u.v)."""
+THERMAL = _of_input('_temperature', lambda v: [f'{vi} * ({WARMTH})' for vi in v])
+TEMPERATURE = ColumnGroup('temperature', (WARMTH,))
+TEMPERATURE_SQUARED = ColumnGroup('temperature_squared', (f'({WARMTH}) ** 2',))
+VIBRATION = ColumnGroup('vibration', tuple(f'vibration_{a}' for a in AXES))
+BRANCH = ColumnGroup('thermal_branch', ('thermal_branch',))
+LEVER = ColumnGroup('lever', (
+    '-(w_y * w_y + w_z * w_z)', 'w_x * w_y - alpha_z', 'w_x * w_z + alpha_y',
+    'w_x * w_y + alpha_z', '-(w_x * w_x + w_z * w_z)', 'w_y * w_z - alpha_x',
+    'w_x * w_z - alpha_y', 'w_y * w_z + alpha_x', '-(w_x * w_x + w_y * w_y)'))
+"""Entries of ``[alpha x] + [omega x]^2`` by rows (Zhang 2017, eq. 11)."""
+ATTITUDE = ColumnGroup('attitude', tuple(f'c_{a}{b}' for a in AXES for b in AXES))
+LOAD = {'accelerometer': ColumnGroup('load_turns_force', tuple(f'f_{AXES[j]} * f_{AXES[k]}' for j, k in PAIRS)),
+        'gyroscope': ColumnGroup('load_turns_rate', tuple(f'f_{a} * w_{b}' for a in AXES for b in AXES))}
+"""Columns of a mount that bends with load: force and rate are measured in a frame that rotates with the force."""
+CHANGE = {'accelerometer': ColumnGroup('force_change', ('f_y * w_z - f_z * w_y', 'f_z * w_x - f_x * w_z', 'f_x * w_y - f_y * w_x')),
+          'gyroscope': ColumnGroup('rate_change', tuple(f'alpha_{a}' for a in AXES))}
+"""The true input's derivative in time, of the force as gravity gives it to a sensor that turns."""
+WARM_UP = {sensor: ColumnGroup(f'{short}_warm_up', ('-expm1(-time / tau)',), f'{short}_bias_drift') for sensor, short in SHORT.items()}
+
+
+def square_coefficients(axes: np.ndarray) -> np.ndarray:
+    """Return the coefficients of `SQUARES` that give (u_i . v)^2 for each row u_i of `axes`, shape (6, 3)."""
+    return np.stack([axes[:, j] * axes[:, k] * (1.0 if j == k else 2.0) for j, k in PAIRS])
+
+
+def cube_coefficients(axes: np.ndarray) -> np.ndarray:
+    """Return the coefficients of `CUBES` that give (u_i . v)^3 for each row u_i of `axes`, shape (10, 3)."""
+    count = [1 if i == j == k else 6 if len({i, j, k}) == 3 else 3 for i, j, k in TRIPLES]
+    return np.stack([axes[:, i] * axes[:, j] * axes[:, k] * m for (i, j, k), m in zip(TRIPLES, count)])
+
+
+def signed_coefficients(axes: np.ndarray) -> np.ndarray:
+    """Return the coefficients of `SIGNED` that give |u_i . v| for each row u_i of `axes`, shape (9, 3)."""
+    block = np.zeros((3, 3, 3), axes.dtype)
+    block[np.arange(3), :, np.arange(3)] = axes
+    return block.reshape(9, 3)
+
+
+@dataclass(frozen=True)
+class Amplitudes:
+    """
+    Values straight before the columns: ``output_i = sum_k value_ik column_k``.
+
+    With three amplitudes and three columns each column may belong to one axis only. A last value that is a time constant is accompanied
+    by the columns' derivatives by it.
+    """
+
+    effect: str
+    """Name of the effect."""
+    group: str
+    """Name of its columns."""
+    own_axis: bool = False
+    """Whether column i acts on axis i only."""
+    time_constant: bool = False
+    """Whether the last value is a time constant."""
+
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
+        """Return the coefficients."""
+        own = values[self.effect]
+        amplitudes = own[:-1] if self.time_constant else own
+        block = np.diag(amplitudes) if self.own_axis else amplitudes.reshape(3, -1).T
+        if self.time_constant:
+            block = np.concatenate([block, block * (own[-1] - point[self.effect][-1])])
+        return {self.group: block}
+
+
+@dataclass(frozen=True)
+class AlongAxis:
+    """
+    Values before a function of the input along each element's own axis.
+
+    ``function(input axes)`` gives the coefficients of one of each.
+    """
+
+    effect: str
+    group: str
+    function: Callable
+
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
+        """Return the coefficients."""
+        return {self.group: self.function(input_axes(values)) * values[self.effect][None, :]}
+
+
+@dataclass(frozen=True)
+class Products:
+    """Values before the last three of six products, which are of different components."""
+
+    effect: str
+    group: str
+
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
+        """Return the coefficients."""
+        block = values[self.effect].reshape(3, 3).T
+        return {self.group: np.concatenate([np.zeros((3, 3), block.dtype), block])}
+
+
+@dataclass(frozen=True)
+class OfOthers:
+    """Two values for each axis, before the columns of the two other axes."""
+
+    effect: str
+    group: str
+
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
+        """Return the coefficients."""
+        block = np.zeros((3, 3), values[self.effect].dtype)
+        block[~np.eye(3, dtype=bool)] = values[self.effect]
+        return {self.group: block.T}
+
+
+@dataclass(frozen=True)
+class OfMatrix:
+    """The sensor's matrix, or its rows times one value per axis."""
+
+    effect: str
+    group: str
+
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
+        """Return the coefficients."""
+        matrix = values['matrix'].reshape(3, 3)
+        return {self.group: matrix.T if self.effect == 'matrix' else (matrix * values[self.effect][:, None]).T}
+
+
+@dataclass(frozen=True)
+class LeverArms:
+    """Coefficients of the lever matrix W_jk for output i: m_ij r_ik (Zhang 2017, eq. 11-17 with the true inverse)."""
+
+    effect: str
+
+    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
+        """Return the coefficients; one arm is repeated for three."""
+        matrix, arms = values['matrix'].reshape(3, 3), np.broadcast_to(values[self.effect].reshape(-1, 3), (3, 3))
+        return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}
+
+
+def input_axes(values: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the unit vectors along which the three sensing elements sense: rows of the matrix, normalised."""
+    matrix = values['matrix'].reshape(3, 3)
+    return matrix / np.sqrt((matrix**2).sum(axis=1))[:, None]

@@ -1,15 +1,154 @@
-"""From parameters to outputs: coefficients of the columns, their derivative, and the prediction of both sensors."""
+"""The columns of a model over a motion, predicted readings, and the model applied to samples."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SENSORS, Effect, Role
-from imu_calibration.effects.columns import columns_at_point, warped_reference
 from imu_calibration.effects.sensor_model import WARP, WARP_LEVER, SensorModel
+from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.table import Table
+
+
+def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
+                     values: dict[str, np.ndarray] | None = None, roughly: bool = False) -> Reference:
+    """
+    Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
+
+    Parameters
+    ----------
+    values : dict, optional
+        Effect name -> values that replace the point of the effect.
+    roughly : bool
+        Approximate a lag by a delay of the same first derivative; a filter averages several delays and costs as many times more.
+
+    """
+    branches = [(1.0, table, motion)]
+    for effect in model.concerning(sensor):
+        if effect.warp is None:
+            continue
+        at = (values or {}).get(effect.name)
+        at = model.point_of(effect) if at is None else np.atleast_1d(at)
+        if not np.any(at):
+            continue
+        warp = getattr(effect.warp, 'single', effect.warp) if roughly else effect.warp
+        branches = [(weight * w, t, m) for weight, a, b in branches for w, t, m in warp(a, b, at)]
+    references = [(weight, reference_motion(t, m, temperature_c)) for weight, t, m in branches]
+    return mean_reference(references, motion)
+
+
+def mean_reference(weighted: Sequence[tuple[float, Reference]], motion: JointMotion) -> Reference:
+    """Return the weighted mean of references (a lag is a mean over delays); attitude from the last, which moves little."""
+    if len(weighted) == 1:
+        return weighted[0][1]
+    total = sum(weight for weight, _ in weighted)
+    first = weighted[0][1]
+    mean = {name: sum(weight * getattr(ref, name) for weight, ref in weighted) / total for name in ('force_s', 'rate_s', 'alpha_s',
+                                                                                                    'mat_sn')}
+    return Reference(motion.time, mean['mat_sn'], mean['force_s'], mean['rate_s'], mean['alpha_s'], first.gravity, first.temperature_c,
+                     motion.thermal_branch, motion.vibration, motion)
+
+
+INPUT_OF = {'accelerometer': 'force_s', 'gyroscope': 'rate_s'}
+
+
+class References:
+    """The motions that a model's sensors are thought to have felt, each worked out once for both sensors where both feel the same."""
+
+    def __init__(self, model: SensorModel, table: Table, motion: JointMotion, *, temperature_c: np.ndarray | None = None):
+        self.model, self.table, self.motion, self.temperature_c = model, table, motion, temperature_c
+        self._known: dict[tuple, Reference] = {}
+
+    def at(self, sensor: str, effect: Effect | None = None, values: np.ndarray | None = None, *, roughly: bool = False) -> Reference:
+        """Return the reference of `sensor`, with other values for one effect where given; `roughly` as in `warped_reference`."""
+        acting = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and np.any(self.model.point_of(e)))
+        change, moved = None, ()
+        if effect is not None and values is not None:
+            change = {effect.name: values}
+            moved = (effect.name, *values) if np.any(values != self.model.point_of(effect)) else ()
+        key = (roughly, acting, *moved)
+        if key not in self._known:
+            self._known[key] = warped_reference(self.model, sensor, self.table, motion=self.motion, temperature_c=self.temperature_c,
+                                                values=change, roughly=roughly)
+        return self._known[key]
+
+
+def columns(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
+            references: References | None = None) -> np.ndarray:
+    """
+    Return the regressors of `sensor`, shape (n, n_columns), in the order of ``model.groups(sensor)``.
+
+    A warp contributes, per parameter, the three components of the derivative of the true input (`force_s` or `rate_s`);
+    its coefficients are matrix times parameter. The derivative is a difference of the exact kinematics.
+    """
+    references = references or References(model, table, motion, temperature_c=temperature_c)
+    ref, layout, parts = references.at(sensor), model.layout(sensor), []
+    if ref.temperature_c is None and any('temperature' in group.uses for group in layout.groups.values()):
+        raise InputError('a thermal effect needs temperatures, none were received; record imu/temperature or omit the effect')
+    warps = {WARP + e.name: e for e in layout.effects if e.warp is not None}
+    for name in layout.rows:
+        if name in warps:
+            parts += warp_columns(model, warps[name], sensor, references=references)
+        elif name in layout.groups:
+            parts.append(layout.groups[name].columns(ref, layout.point))
+    return np.concatenate(parts, axis=1)
+
+
+def warp_columns(model: SensorModel, effect: Effect, sensor: str, *, references: References) -> list[np.ndarray]:
+    """
+    Return the columns of a warp: d(true input)/d(parameter), shape (n, 3 size), and d(lever matrix)/d(parameter) where arms are modelled.
+
+    With `folded_arms` the true input is that at the sensitive points, and there is no second block.
+    """
+    if effect.derivative is not None:
+        return [effect.derivative(references.at(sensor))]
+    clock = model.find('reference', Role.DELAY)
+    if clock is not None and effect.sensor == sensor and not np.any(model.point_of(effect)):
+        effect = clock   # a lag of zero is a delay to first order
+    inputs, levers = [], []
+    # A search folds the arms and needs many warps: forward differences halve the references, with an error of the curvature over a step.
+    # Candidate effects are evaluated with a delay in place of a filter.
+    asking = model.folded_arms is not None
+    for above, below, width in _steps(effect, model.point_of(effect), forward=asking):
+        ends = [references.at(sensor, effect, at, roughly=asking and not np.any(model.point_of(effect))) for at in (above, below)]
+        change = getattr(ends[0], INPUT_OF[sensor]) - getattr(ends[1], INPUT_OF[sensor])
+        if sensor == 'accelerometer' and model.arms and (model.folded_arms is None or model.folded_arms.any()):
+            turned = lever_matrix(ends[0].rate_s, ends[0].alpha_s) - lever_matrix(ends[1].rate_s, ends[1].alpha_s)
+            if model.folded_arms is None:
+                levers.append(turned.reshape(-1, 9) / width)
+            else:
+                change = change + np.einsum('nij,ij->ni', turned, model.folded_arms)
+        inputs.append(change / width)
+    return [np.concatenate(part, axis=1) for part in (inputs, levers) if part]
+
+
+def _steps(effect, at, forward):
+    """
+    Yield (values above, values below, distance) for the derivative by each parameter.
+
+    Nonnegative values are not varied below zero.
+    """
+    for index in range(effect.size):
+        step = np.zeros(effect.size)
+        if index == effect.n_amplitudes and effect.located:
+            yield at, at, 1.0   # least squares does not move the time of a step
+            continue
+        step[index] = effect.step
+        below = at if forward else at - step
+        if effect.nonnegative:
+            step[index] = min(effect.step, 0.5 * at[index]) if at[index] > 0 else effect.step
+            below = at - step if at[index] > 0 and not forward else at
+        yield at + step, below, (at + step - below)[index]
+
+
+def columns_at_point(model: SensorModel, sensor: str, ref: Reference) -> np.ndarray:
+    """Return the columns without the warps' derivatives, which have zero coefficients at the point itself."""
+    layout = model.layout(sensor)
+    return np.concatenate([group.columns(ref, layout.point) for group in layout.groups.values()], axis=1)
 
 
 def coefficients(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:
@@ -118,3 +257,47 @@ def sensor_output(model: SensorModel, sensor: str, values: np.ndarray, *, ref: R
 
     """
     return columns_at_point(model, sensor, ref) @ coefficients_at_point(model, sensor, values)
+
+
+Centre = Mapping[str, np.ndarray]
+"""Column group -> the values of its columns at which an effect that compensation cannot undo counts as zero, shape (width,)."""
+
+
+def not_applied(model: SensorModel) -> list[Effect]:
+    """Return the effects of the sensors that compensation cannot undo: drifts, formulas in joint angles or time."""
+    return [effect for effect in model.effects if effect.sensor in SENSORS and effect.compensation == 'none'
+            and not effect.in_reference and effect.warp is None and effect.groups]
+
+
+def in_time(effect: Effect) -> bool:
+    """Return whether an effect depends on time only."""
+    return all(group.uses <= {'time', 'time constant'} for group in effect.groups)
+
+
+def centred(model: SensorModel, values: np.ndarray, centre: Centre) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return (values, their derivative by the given ones) with columns that are measured from `centre`.
+
+    ``bias + column value = (bias + centre value) + (column - centre) value``: only the biases change.
+
+    Parameters
+    ----------
+    model : SensorModel
+    values : array, shape (n_params,)
+    centre : mapping
+
+    """
+    moved, slope = values.copy(), np.eye(len(values))
+    for sensor, group in ((effect.sensor, group) for effect in not_applied(model) for group in effect.groups if group.name in centre):
+        bias, rows = model.part(sensor, Role.OFFSET), model.layout(sensor).rows[group.name]
+        moved[bias] += centre[group.name] @ coefficients(model, sensor, values)[rows]
+        slope[bias] += np.einsum('q,qan->an', centre[group.name], coefficient_jacobian(model, sensor, values)[rows])
+    return moved, slope
+
+
+def applied_values(model: SensorModel, values: np.ndarray, centre: Centre | None = None) -> np.ndarray:
+    """Return the values with effects that compensation cannot undo at their value in the centre, which the bias contains."""
+    applied = centred(model, values, centre or {})[0]
+    for effect in not_applied(model):
+        applied[model.slices[effect.key]] = effect.prior_values()
+    return np.where(np.isfinite(applied), applied, 0.0)

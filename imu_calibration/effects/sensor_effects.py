@@ -2,10 +2,25 @@
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG, MILLI_G, STANDARD_GRAVITY
-from imu_calibration.effects import regressors
-from imu_calibration.effects.base import AXES, MATRIX, OTHERS, PRODUCTS, SHORT, UNIT, VECTOR, Effect, Role
-from imu_calibration.effects.coefficients import AlongAxis, Amplitudes, LeverArms, OfMatrix, OfOthers, Products
+from imu_calibration.core.units import DEG, MILLI_G, STANDARD_GRAVITY
+from imu_calibration.effects import base
+from imu_calibration.effects.base import (
+    AXES,
+    MATRIX,
+    OTHERS,
+    PRODUCTS,
+    SHORT,
+    UNIT,
+    VECTOR,
+    AlongAxis,
+    Amplitudes,
+    Effect,
+    LeverArms,
+    OfMatrix,
+    OfOthers,
+    Products,
+    Role,
+)
 
 SHAKEN = 0.05
 """Variance of a vibration that is plainly felt, (m/s^2)^2."""
@@ -21,10 +36,10 @@ def _one_axis(table):
 def _pair(sensor):
     """Return the effects that both sensors have, for one of them."""
     accel = sensor == 'accelerometer'
-    short, kind, unit = SHORT[sensor], regressors.INPUT[sensor], UNIT[sensor]
+    short, kind, unit = SHORT[sensor], base.INPUT[sensor], UNIT[sensor]
     small = MILLI_G if accel else 0.01 * DEG
     full = STANDARD_GRAVITY if accel else 100 * DEG
-    own = {group: getattr(regressors, group)[sensor] for group in ('TRUE_INPUT', 'SQUARES', 'SIGNED', 'THERMAL', 'CHANGE', 'WARM_UP')}
+    own = {group: getattr(base, group)[sensor] for group in ('TRUE_INPUT', 'SQUARES', 'SIGNED', 'THERMAL', 'CHANGE', 'WARM_UP')}
     curved = ('static_dense', 'centrifuge') if accel else ('three_speeds',)
 
     def along_axis(name, group, function):
@@ -37,7 +52,7 @@ def _pair(sensor):
             tolerance=small,
             tolerance_reason='1 mg, which tilts a levelled attitude by 1 mrad' if accel else '0.01 deg/s, 0.6 deg of heading a minute',
             prior_sd=2.0 if accel else 0.2, plausible=(('consumer', 1.0 if accel else 0.1, 'field catalogue 6.1, 6.2'),),
-            motion=('static_poses',), compensation='exact', groups=(regressors.ONE,), coefficients=Amplitudes('bias', 'one')),
+            motion=('static_poses',), compensation='exact', groups=(base.ONE,), coefficients=Amplitudes('bias', 'one')),
         Effect(
             name='matrix', sensor=sensor, role=Role.LINEAR, components=MATRIX, shape=(3, 3), unit='1',
             title='matrix (scale factors and axis directions)',
@@ -54,13 +69,13 @@ def _pair(sensor):
             prior_sd=100 * small / full**2,
             plausible=(('consumer', 4e-4 / STANDARD_GRAVITY if accel else 0.5 * DEG / (100 * DEG)**2, 'ADIS16460 data sheet: '
                         '0.1 % / 0.5 % of range'),),
-            motion=curved, compensation='exact', **along_axis(f'{short}_quadratic', 'SQUARES', regressors.square_coefficients)),
+            motion=curved, compensation='exact', **along_axis(f'{short}_quadratic', 'SQUARES', base.square_coefficients)),
         Effect(
             name=f'{short}_scale_asymmetry', sensor=sensor, components=VECTOR, shape=(3,), unit='1', against=(kind,),
             explanation=f'The {sensor} scale factor differs between positive and negative input.',
             tolerance=1e-3, tolerance_reason='1 mg between +1 g and -1 g' if accel else 'as the matrix', prior_sd=0.05,
             plausible=(('consumer', 2e-3, 'field catalogue 6.1: 100-200 ppm typical'),),
-            motion=curved, compensation='exact', **along_axis(f'{short}_scale_asymmetry', 'SIGNED', regressors.signed_coefficients)),
+            motion=curved, compensation='exact', **along_axis(f'{short}_scale_asymmetry', 'SIGNED', base.signed_coefficients)),
         Effect(
             name=f'{short}_thermal_bias', sensor=sensor, components=VECTOR, shape=(3,), unit=f'{unit}/K', against=('temperature',),
             smooth=True,
@@ -68,7 +83,7 @@ def _pair(sensor):
             tolerance=0.1 * small, tolerance_reason='1 mg over 10 K' if accel else '0.01 deg/s over 10 K', prior_sd=10 * small,
             plausible=(('consumer', 2 * MILLI_G if accel else 0.05 * DEG, 'ADXL358, ADIS16460 data sheets, ten times typical'),),
             motion=('warm_up',), compensation='exact', needs=('temperature',),
-            groups=(regressors.TEMPERATURE,), coefficients=Amplitudes(f'{short}_thermal_bias', 'temperature')),
+            groups=(base.TEMPERATURE,), coefficients=Amplitudes(f'{short}_thermal_bias', 'temperature')),
         Effect(
             name=f'{short}_thermal_bias_2', sensor=sensor, components=VECTOR, shape=(3,), unit=f'{unit}/K^2', against=('temperature',),
             smooth=True,
@@ -77,7 +92,7 @@ def _pair(sensor):
             tolerance=0.01 * small, tolerance_reason='1 mg over 10 K' if accel else '0.01 deg/s over 10 K', prior_sd=small,
             plausible=(('consumer', 0.1 * MILLI_G if accel else 2.5e-3 * DEG, 'as much as the first order over 20 K'),),
             motion=('warm_up',), compensation='exact', needs=('temperature',),
-            groups=(regressors.TEMPERATURE_SQUARED,), coefficients=Amplitudes(f'{short}_thermal_bias_2', 'temperature_squared')),
+            groups=(base.TEMPERATURE_SQUARED,), coefficients=Amplitudes(f'{short}_thermal_bias_2', 'temperature_squared')),
         Effect(
             name=f'{short}_thermal_hysteresis', sensor=sensor, components=VECTOR, shape=(3,), unit=unit, against=('temperature',),
             smooth=True,
@@ -86,7 +101,7 @@ def _pair(sensor):
             tolerance=small, tolerance_reason='as the bias', prior_sd=20 * small,
             plausible=(('consumer', 5 * MILLI_G if accel else 0.1 * DEG, 'as much as the thermal bias over some kelvins'),),
             motion=('warm_and_cool',), compensation='exact', needs=('temperature', 'cooling'),
-            groups=(regressors.BRANCH,), coefficients=Amplitudes(f'{short}_thermal_hysteresis', 'thermal_branch')),
+            groups=(base.BRANCH,), coefficients=Amplitudes(f'{short}_thermal_hysteresis', 'thermal_branch')),
         Effect(
             name=f'{short}_vibration_rectification', sensor=sensor, components=VECTOR if accel else MATRIX, shape=(3,) if accel else (3, 3),
             unit=f'{unit}/(m/s^2)^2', against=('time',),
@@ -96,7 +111,7 @@ def _pair(sensor):
             prior_sd=100 * small / SHAKEN,
             plausible=(('consumer', 2.0 if accel else 0.1, ('2 mg/g^2 (ADXL358 data sheet)' if accel else '0.05 deg/s/g^2')
                         + ', where a hundredth of the amplitude is left in the band'),),
-            motion=('shake',), compensation='exact', needs=('vibration',), groups=(regressors.VIBRATION,),
+            motion=('shake',), compensation='exact', needs=('vibration',), groups=(base.VIBRATION,),
             coefficients=Amplitudes(f'{short}_vibration_rectification', 'vibration', own_axis=accel)),
         Effect(
             name=f'{short}_thermal_scale', sensor=sensor, components=VECTOR, shape=(3,), unit='1/K', against=('temperature',),
@@ -137,15 +152,15 @@ ACCELEROMETER = _pair('accelerometer') + (
         explanation='The accelerometer output bends with the cube of its input (K3), so that its scale factor changes with the input.',
         tolerance=MILLI_G / STANDARD_GRAVITY**3, tolerance_reason='1 mg at 1 g', prior_sd=100 * MILLI_G / STANDARD_GRAVITY**3,
         plausible=(('consumer', 1e-4 / STANDARD_GRAVITY**2, 'field catalogue 6.1: some 10 ug/g^3'),),
-        motion=('centrifuge',), compensation='exact', groups=(regressors.CUBES['accelerometer'],),
-        coefficients=AlongAxis('accel_cubic', 'force_cubes', regressors.cube_coefficients)),
+        motion=('centrifuge',), compensation='exact', groups=(base.CUBES['accelerometer'],),
+        coefficients=AlongAxis('accel_cubic', 'force_cubes', base.cube_coefficients)),
     Effect(
         name='accel_cross_product', sensor='accelerometer', components=PRODUCTS, shape=(3, 3), unit='(m/s^2)^-1', against=('force',),
         explanation='The accelerometers are pendulums that give way: '
         'products of specific-force components enter the output (Avrutov 2017, eq. 4).',
         tolerance=MILLI_G / STANDARD_GRAVITY**2, tolerance_reason='1 mg for 1 g on two axes', prior_sd=100 * MILLI_G / STANDARD_GRAVITY**2,
         plausible=(('consumer', 1e-3 / STANDARD_GRAVITY, 'Avrutov 2017, sample 2: 1 mV/g^2'),),
-        motion=('static_dense',), compensation='exact', groups=(regressors.SQUARES['accelerometer'],),
+        motion=('static_dense',), compensation='exact', groups=(base.SQUARES['accelerometer'],),
         coefficients=Products('accel_cross_product', 'force_squares')),
     Effect(
         name='accel_size_effect', sensor='accelerometer', role=Role.ARMS, components=MATRIX, shape=(3, 3), unit='m',
@@ -153,14 +168,14 @@ ACCELEROMETER = _pair('accelerometer') + (
         explanation='The three accelerometers sit at different points: each has a lever arm of its own (Zhang 2017, eq. 11-17).',
         tolerance=1e-3, tolerance_reason='1 mm, 0.1 m/s^2 at 10 rad/s', prior_sd=0.03,
         plausible=(('consumer', 0.03, 'field catalogue 6.1: 1-30 mm'),), motion=('oscillate_x', 'oscillate_y', 'oscillate_z'),
-        compensation='exact', needs=('rotation',), groups=(regressors.LEVER,), coefficients=LeverArms('accel_size_effect')),
+        compensation='exact', needs=('rotation',), groups=(base.LEVER,), coefficients=LeverArms('accel_size_effect')),
     Effect(
         name='lever_arm', sensor='accelerometer', role=Role.ARM, components=VECTOR, shape=(3,), unit='m',
         title='lever arm of the triad (nuisance parameter)', in_reference=True, nuisance=True, contained_in='accel_size_effect',
         explanation='The whole accelerometer triad is displaced from its assumed point: one common lever arm.',
         tolerance=1e-3, tolerance_reason='the same arm, for the whole triad', prior_sd=0.5,
         plausible=(('consumer', 1.0, 'field catalogue 6.1: cm to dm'),), motion=('oscillate_x', 'oscillate_y', 'oscillate_z'),
-        compensation='none', needs=('rotation',), groups=(regressors.LEVER,), coefficients=LeverArms('lever_arm')),
+        compensation='none', needs=('rotation',), groups=(base.LEVER,), coefficients=LeverArms('lever_arm')),
 )
 
 GYROSCOPE = _pair('gyroscope') + (
@@ -170,7 +185,7 @@ GYROSCOPE = _pair('gyroscope') + (
         explanation='The gyroscopes respond to specific force: their bias changes with attitude (g-sensitivity).',
         tolerance=0.01 * DEG / STANDARD_GRAVITY, tolerance_reason='0.01 deg/s at 1 g', prior_sd=1.0 * DEG / STANDARD_GRAVITY,
         plausible=(('consumer', 0.1 * DEG / STANDARD_GRAVITY, 'ADIS16460 data sheet: 0.01 deg/s/g'),), motion=('static_poses',),
-        compensation='exact', groups=(regressors.TRUE_INPUT['accelerometer'],), coefficients=Amplitudes('gyro_g_sensitivity', 'force')),
+        compensation='exact', groups=(base.TRUE_INPUT['accelerometer'],), coefficients=Amplitudes('gyro_g_sensitivity', 'force')),
     Effect(
         name='gyro_force_squared', sensor='gyroscope',
         components=tuple(f'{a}_{pair}' for a in AXES for pair in ('xx', 'yy', 'zz', 'xy', 'yz', 'xz')),
@@ -180,13 +195,13 @@ GYROSCOPE = _pair('gyroscope') + (
         tolerance=0.01 * DEG / STANDARD_GRAVITY**2, tolerance_reason='0.01 deg/s at 1 g', prior_sd=0.2 * DEG / STANDARD_GRAVITY**2,
         plausible=(('consumer', 0.05 * DEG / STANDARD_GRAVITY**2, 'half of the g-sensitivity at 1 g'),),
         motion=('static_dense', 'centrifuge'),
-        compensation='exact', groups=(regressors.SQUARES['accelerometer'],),
+        compensation='exact', groups=(base.SQUARES['accelerometer'],),
         coefficients=Amplitudes('gyro_force_squared', 'force_squares')),
     Effect(
         name='gyro_rate_product', sensor='gyroscope', components=PRODUCTS, shape=(3, 3), unit='(rad/s)^-1', against=('rate',),
         explanation='Products of rate components enter the gyroscope output (Avrutov 2017, eq. 10).',
         tolerance=1e-3, tolerance_reason='as the matrix at 1 rad/s', prior_sd=0.3,
         plausible=(('consumer', 0.06, 'Avrutov 2017, sample 4: 1e-3 V/(deg/s)^2 at 0.1 V/(deg/s) is 0.6'),), motion=('two_axis',),
-        compensation='exact', needs=('rotation',), groups=(regressors.SQUARES['gyroscope'],),
+        compensation='exact', needs=('rotation',), groups=(base.SQUARES['gyroscope'],),
         coefficients=Products('gyro_rate_product', 'rate_squares')),
 )

@@ -123,7 +123,7 @@ class SensorModel:
     catalogue: Catalogue = CATALOGUE
     """Where the effects are declared."""
     centre: dict = field(default_factory=dict)
-    """Column group -> value from which its columns are measured (`effects.applied`)."""
+    """Column group -> value from which its columns are measured (`effects.forward_equations`)."""
 
     def __post_init__(self):
         object.__setattr__(self, 'joint_names', JointNames.of(self.joint_names))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.core.units import STANDARD_GRAVITY
 
 HOUR = 3600.0
 """s; sessions are hardly longer, and changes of a bias over days are constant within a session."""

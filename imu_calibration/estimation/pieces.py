@@ -4,7 +4,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG
+from imu_calibration.core.units import DEG
 
 PIECE_TIME = 0.25
 """Length of a piece, s: noise averages out, and a sweep of a table is still several pieces."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY
+from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.signal_history import ThermalBranch
 
 REST, WAY = 5.0, 3.0

@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.core.samples import rounding_variance
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.columns import References, columns
+from imu_calibration.effects.forward_equations import References, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.pieces import moving_pieces, pieces_at_rest
 from imu_calibration.estimation.triangular import triangular
@@ -86,7 +86,7 @@ def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, 
     session : int
         Recording of the windows.
     column_function : callable
-        Same signature as `effects.columns.columns`.
+        Same signature as `effects.forward_equations.columns`.
     with_pieces : bool
         Keep the short pieces for held-out evaluation.
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.reference_motion import rotation_from_rpy
+from imu_calibration.kinematics.rotations import rotation_from_rpy
 
 LARGEST = 1e6
 """Largest number of a table (axis, place, angle, speed); products of larger numbers would overflow."""

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.earth import NORMAL_GRAVITY_ACCURACY, normal_gravity
 from imu_calibration.kinematics.joint import (
     Joint,
     JointNames,
@@ -22,7 +21,7 @@ from imu_calibration.kinematics.joint import (
     three_numbers,
     unit_vector,
 )
-from imu_calibration.kinematics.reference_motion import align, rotation_from_rpy
+from imu_calibration.kinematics.rotations import NORMAL_GRAVITY_ACCURACY, align, normal_gravity, rotation_from_rpy
 
 PARALLEL = 0.02
 """Sine of the angle up to which two axes count as parallel: their common perpendicular is undefined there."""

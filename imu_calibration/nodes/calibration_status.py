@@ -2,7 +2,7 @@
 
 import math
 
-from imu_calibration.calibration.effect_states import GroupState
+from imu_calibration.calibration.coverage import GroupState
 from imu_calibration.nodes.calibration_state import WorkerState
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, make_status
 

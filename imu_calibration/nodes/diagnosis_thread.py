@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 
 from imu_calibration.calibration.diagnosis.live_diagnosis import FAILED, OFF, Answer, DiagnosisQuestion, DiagnosisState
-from imu_calibration.calibration.model_changes import Demand
+from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.session import SolvePacer
 from imu_calibration.nodes.heap import return_freed_memory
 

@@ -16,10 +16,9 @@ from ros2doctor.api.format import doctor_error, doctor_warn
 from sensor_msgs.msg import Imu
 
 from imu_calibration.nodes.inputs import BatchInput
-from imu_calibration.preprocessing.block_cleaning import BlockCleaner
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.message_checks import check_messages
-from imu_calibration.preprocessing.recording_evidence import GOOD, REFUSE, WARNING, CheckFinding
+from imu_calibration.preprocessing.recording_evidence import GOOD, REFUSE, WARNING, CheckFinding, check_messages
+from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 from msg_adapters.imu_stream import ImuHeads
 from msg_adapters.live import LiveGatherer
 

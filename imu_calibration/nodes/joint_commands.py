@@ -15,7 +15,7 @@ from rclpy.qos import qos_profile_action_status_default
 from trajectory_msgs.msg import JointTrajectory
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
+from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from imu_calibration.nodes.inputs import node_of, output_qos
 from imu_calibration.nodes.lifecycle import guarded
 from msg_adapters.joint_trajectory import encode_trajectory

@@ -29,8 +29,15 @@ from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text
-from imu_calibration.kinematics.motion_limits import NOT_CHECKED, MotionLimits, limit_words, limits_of, missing_ranges, range_warnings
-from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
+from imu_calibration.kinematics.motion_limits import (
+    NOT_CHECKED,
+    MotionLimits,
+    TrajectoryPoints,
+    limit_words,
+    limits_of,
+    missing_ranges,
+    range_warnings,
+)
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
 from imu_calibration.nodes.coverage_markers import driven_markers
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher

@@ -7,7 +7,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.static_transforms import StaticTransforms
+from imu_calibration.kinematics.urdf import StaticTransforms
 from msg_adapters.stamps import clean_name
 
 TOPIC = '/tf_static'

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.reference_motion import skew
+from imu_calibration.kinematics.rotations import skew
 from imu_calibration.papers.linear_least_squares import LinearSolution, solve_linear
 
 COLUMNS = {

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.core.constants import STANDARD_GRAVITY
 from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.kinematics.reference_motion import lever_matrix
+from imu_calibration.core.units import STANDARD_GRAVITY
+from imu_calibration.kinematics.rotations import lever_matrix
 from imu_calibration.papers.linear_least_squares import RANK_TOLERANCE, ToleranceScaled, solve_linear, tolerance_scaled
 
 DESIGNS = ('Z0', 'Z60', 'O', 'M')

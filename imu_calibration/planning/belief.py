@@ -1,4 +1,4 @@
-"""Information of windows of planned motions, and joint information on parameters and biases in the middle of a plan."""
+"""Information on parameters from planned motions, and a lower bound by relaxation."""
 
 from __future__ import annotations
 
@@ -7,16 +7,117 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+import scipy.linalg
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.columns import columns
+from imu_calibration.effects.forward_equations import columns
 from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.simulation.motion_builder import Profile, Segment
+
+ROUNDS = 600
+"""Steps of the multiplicative algorithm; the certificate is mostly within a few per cent after 200."""
+LONGEST = 1e7
+"""Tolerances that are not met after this time for every motion are out of reach, s."""
+CLOSE = 1.01
+"""The search ends when the relaxed value is within this factor of the certificate."""
+
+
+@dataclass(frozen=True, eq=False)
+class Relaxation:
+    """The relaxed plan and its certificate."""
+
+    seconds: float
+    """Lower bound on the time of every plan, s."""
+    visits: np.ndarray
+    """How often the relaxed plan visits each motion, shape (k,)."""
+    prices: np.ndarray
+    """Matrix X: value of a unit of information, s, shape (n, n)."""
+    relaxed_seconds: float
+    """Time of the relaxed plan, s; the value of the programme lies between this and the bound."""
+    weights: np.ndarray
+    """How much each parameter limits the relaxed plan, sum 1, shape (p,)."""
+
+
+def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, asked: np.ndarray, rounds: int = ROUNDS) -> Relaxation:
+    """
+    Return the relaxed plan with the best certificate found; NaN where a tolerance is out of reach.
+
+    Visits and weights are improved by turns with multiplicative steps: visits of motions that are worth more than they cost grow (the
+    algorithm of A-optimal design), and so do the weights of parameters with the largest excess over tolerance.
+
+    Parameters
+    ----------
+    information : ndarray, shape (k, n, n)
+        Most that one visit adds.
+    seconds : ndarray, shape (k,)
+        Cost.
+    known : ndarray, shape (n, n)
+        Information to start with.
+    asked : ndarray, shape (p, n)
+        Rows e_i: parameters in tolerances.
+
+    """
+    weights = np.full(len(asked), 1.0 / len(asked))
+    if _worst(known, asked) <= 1.0:
+        return Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), 0.0, weights)
+    if _worst(known + LONGEST * np.sum(information / seconds[:, None, None], axis=0), asked) > 1.0:
+        return Relaxation(np.nan, np.full(len(seconds), np.nan), np.full_like(known, np.nan), np.nan, weights)
+    kept = np.arange(len(seconds))
+    flat = information.reshape(len(seconds), -1)
+    share = np.full(len(seconds), 1.0 / len(seconds)) / seconds
+    best = Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), np.inf, weights)
+    for number in range(rounds):
+        total, scale = _scaled(np.tensordot(share[kept], flat[kept], 1).reshape(known.shape), known, asked)
+        covariance = inverse_normal(total)   # nearly singular in unreachable directions
+        x = covariance @ asked.T
+        variance = np.einsum('pn,np->p', asked, x)
+        prices = (x * weights) @ x.T
+        worth = np.zeros(len(seconds))
+        full = number % 25 == 0 or number == rounds - 1
+        used = np.arange(len(seconds)) if full else kept
+        worth[used] = flat[used] @ prices.ravel() / seconds[used]
+        relaxed = scale * float(share @ seconds)
+        if full:
+            factor = 1.0 / worth.max()
+            bound = factor * (weights @ (2 * variance - 1) - np.sum(known * prices))
+            if bound > best.seconds:
+                best = Relaxation(float(bound), scale * share, factor * prices, relaxed, weights)
+            if relaxed < CLOSE * best.seconds:
+                break
+            kept = np.flatnonzero((worth > 0.3 * worth.max()) | (share * seconds > 1e-4 * (share @ seconds)))
+        spent = share[kept] * seconds[kept]
+        share[kept] *= np.sqrt(np.maximum(worth[kept], 1e-12) / (worth[kept] @ spent / spent.sum()))
+        mask = np.zeros(len(share), bool)
+        mask[kept] = True
+        share = np.where(mask, share, 0.0 if number > 50 else share)
+        weights = weights * variance / variance.max()
+        weights /= weights.sum()
+    return best
+
+
+def _worst(information, asked):
+    return float(np.einsum('pn,pn->p', asked @ np.linalg.inv(information), asked).max())
+
+
+def _scaled(direction, known, asked):
+    """Return the information with so much of `direction` that the worst parameter just meets its tolerance, and how much that is."""
+    root = np.linalg.cholesky(known)
+    inner = scipy.linalg.solve_triangular(root, scipy.linalg.solve_triangular(root, direction, lower=True).T, lower=True)
+    values, vectors = scipy.linalg.eigh(0.5 * (inner + inner.T))
+    squares = (scipy.linalg.solve_triangular(root, asked.T, lower=True).T @ vectors)**2
+    low, high = -30.0, 60.0
+    while high - low > 1e-4:
+        middle = 0.5 * (low + high)
+        enough = (squares / (1 + np.exp(middle) * np.maximum(values, 0.0))).sum(axis=1).max() <= 1.0
+        low, high = (low, middle) if enough else (middle, high)
+    return known + np.exp(high) * direction, float(np.exp(high))
+
 
 SAMPLING = 16.0
 """Instants per second at which columns are evaluated: a turn at 300 deg/s has 19."""

@@ -7,13 +7,12 @@ from enum import StrEnum
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import setting
-from imu_calibration.kinematics.motion_limits import MotionLimits
-from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
+from imu_calibration.core.units import DEG
+from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
 from imu_calibration.planning.path_watch import PathWatch, at_rest
-from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
+from imu_calibration.simulation.table_controller import excess, trajectory_from
 
 MARGIN = 1e-6
 """Relative excess of a trajectory over a limit that is accepted as rounding."""

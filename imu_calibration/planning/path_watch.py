@@ -7,8 +7,8 @@ from collections import deque
 import numpy as np
 
 from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
-from imu_calibration.simulation.joint_trajectory import trajectory_from
+from imu_calibration.kinematics.motion_limits import TrajectoryPoints
+from imu_calibration.simulation.table_controller import trajectory_from
 
 STEP = 0.01
 """Step of the instants at which the path is evaluated, s."""

@@ -14,18 +14,19 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.window_statistics import BATCH_DOF
 from imu_calibration.planning.belief import (
+    LONGEST,
     Belief,
     PlannedWindow,
+    Relaxation,
     WindowPredictor,
     additive_bound,
     common_variance,
     exact_information,
     least_bias_variance,
+    relax,
 )
 from imu_calibration.planning.coordinates import Coordinates, Goal, WithinTolerances
-from imu_calibration.planning.motions import MotionKind, PlannedMotion
-from imu_calibration.planning.relaxation import LONGEST, Relaxation, relax
-from imu_calibration.planning.repertoire import Repertoire
+from imu_calibration.planning.repertoire import MotionKind, PlannedMotion, Repertoire
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise
 

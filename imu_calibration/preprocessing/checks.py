@@ -9,15 +9,14 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from imu_calibration.core.constants import STANDARD_GRAVITY
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.preprocessing import value_checks
-from imu_calibration.preprocessing.block_cleaning import MESSAGES as NAMES
-from imu_calibration.preprocessing.block_cleaning import BlockCleaner, CleanedBlock
-from imu_calibration.preprocessing.frozen_parts import SENSOR_COLUMNS, long_runs
 from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING, CheckFinding, EvidenceGatherer, RecordingEvidence
+from imu_calibration.preprocessing.scan import SENSOR_COLUMNS, long_runs
 from imu_calibration.preprocessing.stamping import IRREGULAR
-from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
+from imu_calibration.preprocessing.stream_cleaning import MESSAGES as NAMES
+from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, CleanedBlock, StreamStatistics
 
 MOVING = 50.0
 """A constant axis is frozen if another axis moves by this many steps of the converter."""

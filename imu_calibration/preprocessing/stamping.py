@@ -1,15 +1,12 @@
-"""
-Relation of the stamps of one stream to its sampling.
+"""Stamps of samples: period, losses, counted clocks, and times of samples."""
 
-An IMU samples by its own clock; its stamps are often times of arrival: eight at once from a USB packet, delayed by the bus, or
-rounded to milliseconds. Where the stamps are near a line through the sample number, the line gives the sampling times
-(`COUNTED`); where they diverge from every line the sampling itself is irregular, and the stamps are used unchanged.
-"""
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
+
+from imu_calibration.core.samples import ImuSamples
 
 
 class Stamping(StrEnum):
@@ -155,3 +152,263 @@ def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
     arrivals = high - low > period and np.all(step >= 0) and (at_once >= PACKET or skewed)
     origin = low if arrivals else middle
     return StampLine(COUNTED, period, low - origin, high - origin, at_once if arrivals else 1.0)
+
+
+BLOCK = LAG
+"""Samples that give one point of the clock."""
+REACH = 32
+"""Samples on both sides of a long step that decide between lost and late samples; packets are smaller."""
+LOST = 0.6
+"""Samples were lost at a long step if the clock is ahead by more than this share of a period after it, relative to before."""
+FOLLOW = 0.05
+"""A period that has changed by more than this share is another one; smaller changes are averaged."""
+SLOW = 0.1
+"""Weight of a new block in that average."""
+
+
+class CountedClock:
+    """
+    Times of samples from their stamps, in order: each block of 64 gives one point; the times are interpolated linearly between points.
+
+    The points are those of the earliest stamps where stamps are times of arrival, which can only be late, otherwise the means. The
+    result does not depend on the division of the stamps into blocks.
+
+    Parameters
+    ----------
+    line : StampLine
+        Current estimate of the relation of the stamps to the sampling.
+
+    """
+
+    def __init__(self, line: StampLine):
+        self._period, self._arrivals = line.period_ns, line.arrivals
+        self._margin = LOST * line.period_ns + (0.0 if line.arrivals else 0.25 * (line.high_ns - line.low_ns))
+        self._raw, self._times = np.zeros(0, np.int64), [np.zeros(0, np.int64)]
+        self._begin()
+
+    def _begin(self) -> None:
+        """Reset everything except the period."""
+        self._origin_ns: int | None = None
+        self._next = 0.0
+        self._before = np.zeros((2, 0))
+        self._block: np.ndarray | None = None
+        self._points: list[tuple[float, float]] = []
+
+    def push(self, stamp_ns: np.ndarray) -> None:
+        """Add stamps in the order of arrival."""
+        self._raw = np.concatenate([self._raw, stamp_ns])
+
+    def take(self, final: bool = False) -> np.ndarray:
+        """Return the times that are determined now (all with `final`), int64, ns, in the order of the stamps."""
+        while len(self._raw) >= BLOCK + REACH or (final and len(self._raw)):
+            pause = np.flatnonzero(np.diff(self._raw[:BLOCK + REACH]) > PAUSE_NS)
+            end = len(self._raw) if not len(pause) else int(pause[0]) + 1
+            self._work(self._raw[:min(BLOCK, end)], self._raw[min(BLOCK, end):min(BLOCK + REACH, end)])
+            self._raw = self._raw[min(BLOCK, end):]
+            if len(pause) and end <= BLOCK:
+                self._finish()
+        if final:
+            self._finish()
+        times, self._times = np.concatenate(self._times), [np.zeros(0, np.int64)]
+        return times
+
+    def _work(self, stamp_ns: np.ndarray, ahead_ns: np.ndarray) -> None:
+        """Number a block, compute its point, and compute the times of the block before it."""
+        if self._origin_ns is None:
+            self._origin_ns = int(stamp_ns[0])
+        stamp = (np.concatenate([stamp_ns, ahead_ns]) - self._origin_ns).astype(float)
+        number = self._numbered(stamp, len(stamp_ns))
+        stamp = stamp[:len(stamp_ns)]
+        self._before = np.stack([np.concatenate([self._before[0], number]), np.concatenate([self._before[1], stamp])])[:, -REACH:]
+        self._next = number[-1] + 1
+        if len(number) >= BLOCK // 2 or not self._points:   # the few samples of a shorter one may all be late
+            late = stamp - self._period * number
+            usual = late.min() if self._arrivals else late.mean()
+            self._points.append((float(number.mean()), float(usual + self._period * number.mean())))
+        if self._block is not None:
+            self._tell(self._block)
+            self._follow()
+        self._block = number
+
+    def _numbered(self, stamp: np.ndarray, count: int) -> np.ndarray:
+        """Return the numbers of the first `count` samples: increments of one, plus the number of samples lost at a long step."""
+        middle = np.min if self._arrivals else np.median
+        number = self._next + np.arange(len(stamp))
+        step = np.diff(stamp, prepend=self._before[1, -1] if self._before.shape[1] else stamp[0])
+        for k in np.flatnonzero(step[:count] > LATE * self._period):
+            past = np.concatenate([self._before[1] - self._period * self._before[0], stamp[:k] - self._period * number[:k]])[-REACH:]
+            if len(past):
+                jump = middle(stamp[k:k + REACH] - self._period * number[k:k + REACH]) - middle(past)
+                number[k:] += np.round(jump / self._period) if jump > self._margin else 0.0
+        return number[:count]
+
+    def _tell(self, number: np.ndarray) -> None:
+        """Compute the times of a block, from its point and the points of its neighbours."""
+        points = np.array(self._points)
+        ends = (points[0] - (BLOCK, BLOCK * self._period), points[-1] + (BLOCK, BLOCK * self._period))
+        points = np.vstack([ends[0], points, ends[1]])
+        times = np.interp(number, points[:, 0], points[:, 1])
+        self._times.append(self._origin_ns + np.rint(times).astype(np.int64))
+
+    def _follow(self) -> None:
+        """Update the period; keep the last two points."""
+        if len(self._points) < 2:
+            return
+        (n0, t0), (n1, t1) = self._points[-2:]
+        period = (t1 - t0) / (n1 - n0)
+        self._period = period if abs(period - self._period) > FOLLOW * self._period else self._period + SLOW * (period - self._period)
+        self._points = self._points[-2:]
+
+    def _finish(self) -> None:
+        """Compute the remaining times, and reset."""
+        if self._block is not None:
+            self._tell(self._block)
+        self._begin()
+
+
+RARE = 4
+"""Counted stamps are reviewed once in this number of blocks."""
+HISTORY = 4 * LAG
+"""Number of stamps for the decision between counted and irregular."""
+
+
+class SampleTimes:
+    """
+    Assigns regular times to samples with irregular stamps; the result does not depend on the division of the stream into blocks.
+
+    Regular stamps pass unchanged and without delay, except for the first few; they are reviewed every 64 samples. Repeated messages (same
+    stamp, same readings) are removed.
+    """
+
+    def __init__(self) -> None:
+        self.line: StampLine | None = None
+        """Relation of the stamps to the sampling, as far as known."""
+        self.n_rebuilt = self.n_irregular = self.n_repeated = 0
+        """Samples with a computed time; samples whose stamps follow no clock; repeated messages."""
+        self._odd_lines: dict[Stamping, StampLine] = {}
+        self._last: Any = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self._learning = True
+        self._clock: Any = None
+        self._held: Any = None
+        self._history, self._unseen, self._reviewed = np.zeros(0, np.int64), 0, 0
+
+    def push(self, samples: ImuSamples) -> ImuSamples | None:
+        """Return the samples whose times are determined now, in the order of arrival; None for none."""
+        if self._pass(samples):
+            return samples
+        samples, ready = self._without_repeated(samples), []
+        while len(samples):
+            part, samples = samples.select(slice(0, BLOCK - self._unseen)), samples.select(slice(BLOCK - self._unseen, None))
+            self._unseen = (self._unseen + len(part)) % BLOCK
+            self._history = np.concatenate([self._history, part.stamp_ns])[-HISTORY:]
+            ready += self._take(part)
+        return _joined(ready)
+
+    def finish(self) -> ImuSamples | None:
+        """Return the buffered samples, and reset."""
+        if self._learning and self._held is not None:
+            self._judge(describe_stamps(self._held.stamp_ns))
+        ready = self._counted(final=True) if self._clock is not None else [self._held]
+        self._begin()
+        return _joined(ready)
+
+    def _pass(self, samples: ImuSamples) -> bool:
+        """Return whether all steps agree with the known clock: the usual case, without further tests."""
+        if self._learning or self._clock is not None or self.line is None or not len(samples):
+            return False
+        step = np.diff(np.concatenate([self._history[-self._unseen - 1:], samples.stamp_ns]))   # the complete block of the next review
+        if not np.all((step > EARLY * self.line.period_ns) & (step <= LATE * self.line.period_ns)):
+            return False
+        self._unseen = (self._unseen + len(samples)) % BLOCK
+        self._history = np.concatenate([self._history, samples.stamp_ns[-HISTORY:]])[-HISTORY:]
+        self._last = samples.select(slice(len(samples) - 1, None))
+        return True
+
+    def _without_repeated(self, samples: ImuSamples) -> ImuSamples:
+        joined = samples if self._last is None else ImuSamples.concatenate([self._last, samples])
+        at = np.flatnonzero(joined.stamp_ns[1:] == joined.stamp_ns[:-1])
+        same = at[np.all(joined.force_s[at] == joined.force_s[at + 1], axis=1) & np.all(joined.rate_s[at] == joined.rate_s[at + 1], axis=1)]
+        self._last = joined.select(slice(len(joined) - 1, None))
+        if not len(same):
+            return samples
+        self.n_repeated += len(same)
+        new = np.arange(len(joined)) >= len(joined) - len(samples)
+        new[same + 1] = False
+        return joined.select(new)
+
+    def _take(self, part: ImuSamples) -> list:
+        """Add a block or a part of one; return the samples that are ready."""
+        if self._learning:
+            self._held = part if self._held is None else ImuSamples.concatenate([self._held, part])
+            stamp_ns = self._held.stamp_ns
+            line = describe_stamps(stamp_ns[:LEAST + 1] if len(stamp_ns) < HISTORY else stamp_ns) if len(stamp_ns) > LEAST else None
+            if line is None and len(stamp_ns) < HISTORY:
+                return []
+            self._learning = False
+            return self._judge(line) + self._on(None)
+        ready = self._on(part)
+        if not self._unseen:
+            self._reviewed = (self._reviewed + 1) % RARE
+            if self._odd() if self._clock is None else not self._reviewed:
+                ready += self._judge(describe_stamps(self._history))
+        return ready
+
+    def _on(self, part: ImuSamples | None) -> list:
+        """Return the held samples and a further part, unchanged or with times from the clock."""
+        if self._clock is None:
+            held, self._held = self._held, None
+            self.n_irregular += len(part or ()) if self.line is not None and self.line.word == IRREGULAR else 0
+            return [held, part]
+        if part is not None:
+            self._clock.push(part.stamp_ns)
+            self._held = part if self._held is None else ImuSamples.concatenate([self._held, part])
+        return self._counted()
+
+    def _counted(self, final: bool = False) -> list:
+        """Return the samples at the front whose times are determined."""
+        times = self._clock.take(final)
+        if not len(times):
+            return []
+        timed, self._held = self._held.select(slice(0, len(times))), self._held.select(slice(len(times), None))
+        self.n_rebuilt += len(times)
+        return [replace(timed, stamp_ns=times)]
+
+    def odd_line(self, count: int) -> StampLine | None:
+        """Return the relation of the irregular stamps to the sampling, when it concerns more than a few of `count` samples."""
+        number, word = max((self.n_rebuilt, COUNTED), (self.n_irregular, IRREGULAR))
+        return self._odd_lines.get(word) if number > IRREGULAR_SHARE * count else None
+
+    def _odd(self) -> bool:
+        """Return whether the steps of the last block differ from the known clock."""
+        if self.line is None:
+            return True
+        step = np.diff(self._history[-BLOCK - 1:])
+        regular = (step > EARLY * self.line.period_ns) & (step <= LATE * self.line.period_ns)
+        return bool(np.count_nonzero(~regular) > IRREGULAR_SHARE * len(step))
+
+    def _judge(self, line: StampLine | None) -> list:
+        """Start or stop counting according to the stamps; return the samples that become ready."""
+        if line is None:
+            return []
+        before, self.line = self.line, line
+        self._odd_lines[line.word] = line
+        changed = before is not None and abs(line.period_ns - before.period_ns) > FOLLOW * before.period_ns
+        if (line.word == COUNTED) == (self._clock is not None) and not (changed and self._clock is not None):
+            return []
+        ready = []
+        if self._clock is not None:
+            ready, self._clock = self._counted(final=True), None
+            if line.word != COUNTED:
+                return ready
+        self._clock = CountedClock(line)
+        if self._held is not None:
+            self._clock.push(self._held.stamp_ns)
+        return ready
+
+
+def _joined(parts: list) -> ImuSamples | None:
+    parts = [part for part in parts if part is not None and len(part)]
+    return parts[0] if len(parts) == 1 else ImuSamples.concatenate(parts) if parts else None

@@ -5,8 +5,8 @@ from enum import StrEnum
 from typing import Any
 
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.preprocessing.block_cleaning import MESSAGES
 from imu_calibration.preprocessing.stamping import IRREGULAR, StampLine
+from imu_calibration.preprocessing.stream_cleaning import MESSAGES
 from imu_calibration.preprocessing.window_cutter import dropped
 
 SILENT_AFTER = 2.0

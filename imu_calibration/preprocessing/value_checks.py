@@ -4,13 +4,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.units import OTHER_UNITS, significant, unit_of_rest
-from imu_calibration.preprocessing.exchanges import CLEAR, match_axes
-from imu_calibration.preprocessing.frozen_parts import SENSOR_COLUMNS
+from imu_calibration.core.units import DEG, OTHER_UNITS, STANDARD_GRAVITY, significant, unit_of_rest
 from imu_calibration.preprocessing.full_scale import FACTORS, nearest_power
+from imu_calibration.preprocessing.on_table import CLEAR, match_axes
 from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING, CheckFinding, RecordingEvidence
+from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 
 CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
 GRAVITY_SHARE = 0.02

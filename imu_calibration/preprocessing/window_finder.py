@@ -7,9 +7,9 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import JointSamples, NominalScaling, SampleBlock
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.block_cleaning import STREAMS, BlockCleaner, Watcher
-from imu_calibration.preprocessing.quiet_detector import QuietFloor
+from imu_calibration.preprocessing.rest_detection import QuietFloor
 from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT, MotionChunks
+from imu_calibration.preprocessing.stream_cleaning import STREAMS, BlockCleaner, Watcher
 from imu_calibration.preprocessing.window import UnusedReason, Window, WindowKind, WindowSettings
 from imu_calibration.preprocessing.window_cutter import WindowCutter
 

@@ -7,8 +7,7 @@ import numpy as np
 from imu_calibration.calibration.installation_angles import PAIRS, derive, in_paper_units
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.compensation.compensate import arms_of
-from imu_calibration.core.constants import DEG
-from imu_calibration.core.units import decimals
+from imu_calibration.core.units import DEG, decimals
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.report.figures import AXIS, GREY, INK, draw
 from imu_calibration.report.numbers import fixed, pair

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from imu_calibration.calibration.hand_step import HandStep, direction_words
-from imu_calibration.kinematics.reference_motion import align
+from imu_calibration.kinematics.rotations import align
 from imu_calibration.report.figures import AXIS, FAINT, GREY, INK, draw
 
 SIZE = np.array([1.0, 0.7, 0.3])

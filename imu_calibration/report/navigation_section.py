@@ -11,7 +11,7 @@ from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.standard_motions import _attitudes
 from imu_calibration.kinematics.chain import reference_motion
-from imu_calibration.kinematics.reference_motion import Reference, lever_matrix
+from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.strapdown import strapdown
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, draw, log_axis
 from imu_calibration.report.numbers import text

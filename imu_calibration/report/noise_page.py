@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from imu_calibration.allan import summary
+from imu_calibration.allan import document
+from imu_calibration.allan.document import position_budget
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification
-from imu_calibration.allan.summary import position_budget
 from imu_calibration.allan.terms import DETERMINED, HELD, WEAK
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.report.noise_curve import draw_curve
@@ -18,10 +18,10 @@ RATES = (50.0, 100.0, 200.0, 400.0, 1000.0)
 
 def noise_report(result: NoiseIdentification, figures: NoiseFigures, horizon: float = HORIZON) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
-    found = summary.counts(figures)
+    found = document.counts(figures)
     word = 'good' if not found[WEAK] and not found[HELD] else 'weak'
     headline = f'{found[DETERMINED]} of {sum(found.values())} figures determined'
-    first, *rest = summary.lines(figures)
+    first, *rest = document.lines(figures)
     return render('noise.html', title='Noise of an IMU', headline=headline, word=word, first=first, lines=rest, facts=_facts(figures),
                   tiles=_tiles(figures, horizon), tables=_tables(figures),
                   curves={sensor: draw_curve(result, sensor) for sensor in SENSORS},
@@ -32,7 +32,7 @@ def noise_report(result: NoiseIdentification, figures: NoiseFigures, horizon: fl
 def _facts(figures):
     bags = figures.provenance.get('bags') or []
     return [('recording', ', '.join(bag['name'] for bag in bags) or 'not named'), ('frame', figures.frame_id or 'not named'),
-            ('sampling', f'{text(figures.rate, 4)} Hz'), ('at rest', summary.duration(figures.recording['seconds_at_rest']))]
+            ('sampling', f'{text(figures.rate, 4)} Hz'), ('at rest', document.duration(figures.recording['seconds_at_rest']))]
 
 
 def _tiles(figures, horizon):
@@ -41,7 +41,7 @@ def _tiles(figures, horizon):
     for sensor, unit, walk_unit in (('accelerometer', 'm/s²/√Hz', 'm/s³/√Hz'), ('gyroscope', 'rad/s/√Hz', 'rad/s²/√Hz')):
         found = figures.densities(sensor, horizon)
         for what, number, of, note in (('noise density', found.white, unit, 'of the worst axis'),
-                                       ('random walk', found.walk, walk_unit, summary.BASIS[found.basis])):
+                                       ('random walk', found.walk, walk_unit, document.BASIS[found.basis])):
             tiles.append({'what': f'{sensor} {what}', 'number': text(number), 'unit': of, 'before': '', 'note': note})
     return tiles
 
@@ -49,7 +49,7 @@ def _tiles(figures, horizon):
 def _tables(figures):
     """Return the rows of each sensor, one group for every figure."""
     tables = {sensor: {} for sensor in SENSORS}
-    for row in summary.rows(figures):
+    for row in document.rows(figures):
         tables[row.sensor].setdefault((row.title, row.unit), []).append(row)
     return tables
 
@@ -58,7 +58,7 @@ def _filters(figures, horizon):
     rows = []
     for sensor in SENSORS:
         found = figures.densities(sensor, horizon)
-        rows.append({'sensor': sensor, 'white': text(found.white, 4), 'walk': text(found.walk, 4), 'basis': summary.BASIS[found.basis]})
+        rows.append({'sensor': sensor, 'white': text(found.white, 4), 'walk': text(found.walk, 4), 'basis': document.BASIS[found.basis]})
     return rows
 
 

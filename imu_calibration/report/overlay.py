@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.diagnosis.traces import Traces
-from imu_calibration.core.constants import STANDARD_GRAVITY
-from imu_calibration.core.units import for_people
+from imu_calibration.core.units import STANDARD_GRAVITY, for_people
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
 from imu_calibration.report.numbers import text
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.planning.hand_plan import HandPlan
-from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.planner import Plan
+from imu_calibration.planning.repertoire import MotionKind
 from imu_calibration.report.drawn import Drawn
 from imu_calibration.report.figures import AXIS, FAINT, GREY, draw, log_axis
 

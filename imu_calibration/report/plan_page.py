@@ -9,8 +9,8 @@ import numpy as np
 from imu_calibration.core.units import for_people
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.planning.hand_plan import HandPlan
-from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.planner import Plan
+from imu_calibration.planning.repertoire import MotionKind
 from imu_calibration.report.hand_plan_figure import draw_steps
 from imu_calibration.report.numbers import text
 from imu_calibration.report.page import render

@@ -9,7 +9,7 @@ from scipy.linalg import svd
 
 from imu_calibration.core.distributions import chi2_sf
 from imu_calibration.effects.expressions import array_function, read
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.selection.grammar import Formula
 from imu_calibration.selection.residual_blocks import RestBlocks
 from imu_calibration.selection.search import FAMILY_WISE, TIE

@@ -7,7 +7,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from imu_calibration.core.errors import NotObservableError
-from imu_calibration.effects.lags import CLOCK, FAMILY
+from imu_calibration.effects.reference_effects import CLOCK, FAMILY
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window

@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.lags import CLOCK, CLOCKS, FAMILY, lag_name
+from imu_calibration.effects.reference_effects import CLOCK, CLOCKS, FAMILY, lag_name
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.questions import Question, point_with

@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.effects.base import AXES, SENSORS, SHORT, Effect
-from imu_calibration.effects.term import term
+from imu_calibration.effects.catalogue import term
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import LEAST_SHARE_SMOOTH

@@ -10,7 +10,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_at_rest import VIBRATES
 from imu_calibration.kinematics.signal_history import HALF_WIDTH
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.quiet_detector import least_variance
+from imu_calibration.preprocessing.rest_detection import least_variance
 from imu_calibration.preprocessing.window import Window
 
 TURN = 4 * HALF_WIDTH

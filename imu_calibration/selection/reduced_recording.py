@@ -7,8 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.columns import References, columns
-from imu_calibration.effects.forward_equations import all_arms, coefficients
+from imu_calibration.effects.forward_equations import References, all_arms, coefficients, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, restricted_window, selected_columns
 from imu_calibration.estimation.noise_model import sessions_of

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG
+from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES
 from imu_calibration.selection.residual_blocks import RestBlocks
 

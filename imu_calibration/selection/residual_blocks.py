@@ -7,12 +7,11 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.columns import References, columns
-from imu_calibration.effects.forward_equations import predict
+from imu_calibration.effects.forward_equations import References, columns, predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_at_rest import LEAST_NOISE
 from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, all_samples, chunks
 from imu_calibration.selection.attempt import Attempt

@@ -8,8 +8,7 @@ import numpy as np
 from imu_calibration.core.distributions import norm_sf
 from imu_calibration.core.samples import rounding_variance
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.columns import References, columns
-from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
+from imu_calibration.effects.forward_equations import References, coefficient_jacobian, coefficients, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.estimation.window_statistics import joined_motion

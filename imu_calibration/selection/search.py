@@ -7,8 +7,8 @@ from typing import AbstractSet
 
 import numpy as np
 
-from imu_calibration.core.constants import STANDARD_GRAVITY
 from imu_calibration.core.progress import reported
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.selection.evidence import Evidence
 from imu_calibration.selection.questions import Question

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG
-from imu_calibration.core.units import for_people, significant
+from imu_calibration.core.units import DEG, for_people, significant
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window

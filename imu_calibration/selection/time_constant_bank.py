@@ -8,7 +8,7 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import effect_slopes
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.rotations import Reference
 
 WIDE = 10.0
 """

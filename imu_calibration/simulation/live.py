@@ -7,10 +7,9 @@ import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.columns import warped_reference
-from imu_calibration.effects.forward_equations import clip
+from imu_calibration.effects.forward_equations import clip, warped_reference
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.kinematics.reference_motion import lever_matrix
+from imu_calibration.kinematics.rotations import lever_matrix
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.sensor_noise import Cause, Felt, quantise, read_encoders
 from imu_calibration.simulation.session import SimulationOptions, answered, temperature_at

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG, DEG_H, MICRO_G, STANDARD_GRAVITY
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.units import DEG, DEG_H, MICRO_G, STANDARD_GRAVITY
 
 
 @dataclass(frozen=True)

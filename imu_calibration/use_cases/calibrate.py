@@ -11,20 +11,19 @@ from typing import Unpack
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.result import CalibrationResult, exit_code, summary
-from imu_calibration.calibration.table_check import check_on_table
+from imu_calibration.calibration.table_calibration import check_on_table
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter, report
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.statements import Verdict
+from imu_calibration.document.decision import Verdict
 from imu_calibration.document.verdict import judged
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
 from imu_calibration.use_cases.drawing import Drawing
-from imu_calibration.use_cases.pool import jobs_for, process_mapper
 from imu_calibration.use_cases.provenance import provenance_with
-from imu_calibration.use_cases.recordings import name_of, open_bag, source_of
+from imu_calibration.use_cases.recordings import jobs_for, name_of, open_bag, process_mapper, source_of
 from imu_calibration.use_cases.stand import Stand, table_of
 
 

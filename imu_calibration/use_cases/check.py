@@ -5,7 +5,7 @@ from os import PathLike
 from typing import Unpack
 
 from imu_calibration.calibration.hand_check import check_by_hand, gravity_of
-from imu_calibration.calibration.table_check import CheckResult, check_on_table
+from imu_calibration.calibration.table_calibration import CheckResult, check_on_table
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration

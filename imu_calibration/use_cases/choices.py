@@ -1,4 +1,4 @@
-"""Options for the calibration or diagnosis of a recording: by name, each with a default."""
+"""Choices of the user by name, and the list of effects."""
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
@@ -11,7 +11,8 @@ from imu_calibration.core.settings import override
 from imu_calibration.document import files
 from imu_calibration.document.calibration_text import checked_tolerances
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.kinematics.earth import local_gravity
+from imu_calibration.estimation.standard_motions import MOTIONS
+from imu_calibration.kinematics.rotations import local_gravity
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.recordings import Topics
@@ -122,3 +123,36 @@ def nominal_of(chosen: str | PathLike | NominalScaling | None) -> NominalScaling
     if strange:
         raise InputError(f"{chosen} may name {', '.join(known)}; it names {', '.join(strange)}; correct it")
     return NominalScaling(**{name: float(value) for name, value in mapping.items()})
+
+
+SHOWN = 3
+"""Columns of an equation that are shown."""
+
+
+def effect_rows(added: str | PathLike | None = None) -> list[dict[str, Any]]:
+    """
+    Return one mapping per effect: name, sensor, unit, tolerance, compensation, sentence, equation, required data and motion.
+
+    Raises
+    ------
+    InputError
+        When the file of additional effects cannot be used.
+
+    """
+    return [_row(effect) for effect in catalogue_of(added).effects().values()]
+
+
+def _row(effect):
+    units = (effect.unit,) if isinstance(effect.unit, str) else tuple(dict.fromkeys(effect.unit))
+    needs = [*effect.needs, *(motion.text for motion in MOTIONS if motion.name in effect.motion)]
+    return {'effect': effect.name, 'sensor': effect.sensor, 'unit': ', '.join(units), 'tolerance': effect.tolerance,
+            'compensation': effect.compensation, 'text': effect.explanation, 'equation': _equation(effect), 'needs': '; '.join(needs)}
+
+
+def _equation(effect):
+    """Return the output of the effect as a sum of coefficients times columns; empty where it changes the reference motion."""
+    columns = [text for group in effect.groups for text in group.text]
+    if not columns or effect.warp is not None:
+        return ''
+    shown = ' + '.join(f'k{n} * ({text})' if ' ' in text else f'k{n} * {text}' for n, text in enumerate(columns[:SHOWN], 1))
+    return f'output_i += {shown}{f" + ... ({len(columns)} columns)" if len(columns) > SHOWN else ""}'

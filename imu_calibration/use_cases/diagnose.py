@@ -77,7 +77,7 @@ class Diagnosed:
 
     def save_overlay(self, path: str | PathLike) -> None:
         """Write measured and simulated signals, residuals, spectra and histograms as MCAP for Foxglove (`overlay_file.overlay_bytes`)."""
-        from imu_calibration.use_cases.overlay_file import overlay_bytes
+        from imu_calibration.use_cases.view import overlay_bytes
         diagnosis = self.result.diagnosis
         files.write_whole(path, overlay_bytes(diagnosis.traces, diagnosis.baseline.model.joint_names))
 

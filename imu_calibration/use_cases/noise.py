@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
 
-from imu_calibration.allan.document import noise_to_text
+from imu_calibration.allan.document import exit_code, lines, noise_to_text
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification, figures_of, identify_noise
-from imu_calibration.allan.summary import exit_code, lines
 from imu_calibration.core.samples import NominalScaling, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.preprocessing.checks import warnings

@@ -13,17 +13,17 @@ import numpy as np
 
 from imu_calibration.calibration.table_calibration import calibration_of_saved
 from imu_calibration.core import documents
-from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE, SensorModel, parse_effects
 from imu_calibration.kinematics.motion_limits import NOT_CHECKED, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.kinematics.table import Table
+from imu_calibration.planning.campaign import make_separator
 from imu_calibration.planning.hand_plan import HandPlan, hand_plan_to_mapping, plan_by_hand
 from imu_calibration.planning.planner import Plan, make_planner, plan_to_mapping, trajectory_to_mapping
-from imu_calibration.planning.separation import make_separator
 from imu_calibration.planning.situation import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.use_cases.choices import calibration_options
@@ -95,7 +95,7 @@ class Planned:
         files.write_text(place / 'plan.yaml', text)
 
     def _messages(self):
-        from imu_calibration.planning.motions import trajectory
+        from imu_calibration.planning.repertoire import trajectory
         names, begins = self.plan.motions[0].joint_names, np.concatenate([[0.0], self.plan.ends[:-1]])
         return [(START_NS + round(float(begin) * 1e9), trajectory(names, segments))
                 for begin, segments in zip(begins, self.plan.segments, strict=True) if segments]

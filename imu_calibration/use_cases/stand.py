@@ -11,9 +11,8 @@ from typing import Any
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
-from imu_calibration.kinematics.static_transforms import up_of
 from imu_calibration.kinematics.table import Table
-from imu_calibration.kinematics.urdf import root_of, table_from_urdf
+from imu_calibration.kinematics.urdf import root_of, table_from_urdf, up_of
 from imu_calibration.use_cases.recordings import Topics, existing
 from msg_adapters.description import description_in, frame_of, static_transforms
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.allan.curve import SampleGrid, spread
-from imu_calibration.allan.deviation import FULL, AllanSums, averaging_factors, overlapping_allan_variance
+from imu_calibration.allan.curve import FULL, AllanSums, SampleGrid, averaging_factors, overlapping_allan_variance, spread
 
 PERIOD = 0.01
 
@@ -42,7 +41,7 @@ def test_deviations_are_those_of_allantools(n):
 def test_beyond_the_full_overlap_the_rate_is_halved_and_nothing_is_lost(monkeypatch):
     """At a limit of 64 the halved rates take over early; they agree with allantools on the halved record, and with every position closely."""
     allantools = pytest.importorskip('allantools', reason='pip install --no-deps -r constraints/oracles-alone.txt')
-    monkeypatch.setattr('imu_calibration.allan.deviation.FULL', 64)
+    monkeypatch.setattr('imu_calibration.allan.curve.FULL', 64)
     values = record(40_000, 3)
     factors = averaging_factors(len(values))
     ours = np.sqrt(in_pieces(values, factors, 1).variance()[:, 0])

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.allan.deviation import AllanSums, averaging_factors
+from imu_calibration.allan.curve import AllanSums, averaging_factors
 from imu_calibration.allan.moment_fit import Moments
-from imu_calibration.allan.scale_covariance import ScaleCovariance
+from imu_calibration.allan.processes import ScaleCovariance
 from imu_calibration.allan.terms import identify_axis, predicted, scatter_of
 from imu_calibration.allan.trends import Parts
 

@@ -8,24 +8,35 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from imu_calibration.allan.deviation import averaging_factors, overlapping_allan_variance
-from imu_calibration.allan.forms import PROCESSES, Choice, choose_form, fit_form, fit_names, log_cost, without_finest
+from imu_calibration.allan.curve import averaging_factors, overlapping_allan_variance
+from imu_calibration.allan.document import position_sd
 from imu_calibration.allan.identify import RecordingTimes
-from imu_calibration.allan.moment_fit import RIDGE, Moments
+from imu_calibration.allan.moment_fit import RIDGE, Moments, pearson_tails
 from imu_calibration.allan.processes import (
     FLATNESS,
     FLICKER,
     QUANTISATION,
     RANDOM_WALK,
     WHITE,
+    ScaleCovariance,
     allan_variance,
     gauss_markov,
     mean_covariance,
 )
-from imu_calibration.allan.scale_covariance import ScaleCovariance
-from imu_calibration.allan.score_intervals import pearson_tails
-from imu_calibration.allan.summary import position_sd
-from imu_calibration.allan.terms import DETERMINED, HELD, TIME, WEAK, identify_axis
+from imu_calibration.allan.terms import (
+    DETERMINED,
+    HELD,
+    PROCESSES,
+    TIME,
+    WEAK,
+    Choice,
+    choose_form,
+    fit_form,
+    fit_names,
+    identify_axis,
+    log_cost,
+    without_finest,
+)
 
 from worlds.noise_worlds import FORMS, AxisTruth, draw_truth, flicker, random_walk
 

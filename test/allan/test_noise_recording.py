@@ -9,10 +9,9 @@ import yaml
 from refusal import refused
 from scipy.signal import lfilter
 
-from imu_calibration.allan.document import noise_from_text, noise_to_text
+from imu_calibration.allan.document import exit_code, filter_lines, lines, noise_from_text, noise_to_text
 from imu_calibration.allan.identify import figures_of, identify_noise, read_rest
 from imu_calibration.allan.processes import RANDOM_WALK
-from imu_calibration.allan.summary import exit_code, filter_lines, lines
 from imu_calibration.allan.terms import HELD, Term, identify_axis
 from imu_calibration.allan.trends import AxisTrend, Blocks, TrendSearch
 from imu_calibration.cli.main import main

@@ -10,10 +10,9 @@ from refusal import refused
 from test_adapters_copy import raw_messages
 from test_live_calibration import blocks
 
-from imu_calibration.allan.document import noise_to_text
+from imu_calibration.allan.document import noise_to_text, position_budget
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures, bias_processes
 from imu_calibration.allan.processes import FLICKER, RANDOM_WALK, allan_variance, gauss_markov
-from imu_calibration.allan.summary import position_budget
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, Term
 from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings

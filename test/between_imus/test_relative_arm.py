@@ -6,12 +6,11 @@ from refusal import refused
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.between_imus.arm import RelativeArm, estimate_arm
-from imu_calibration.between_imus.pair import clipped
+from imu_calibration.between_imus.pair import clipped, make_windows
 from imu_calibration.calibration.hand_workflow import read_imu
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.kinematics.modulating_functions import make_windows
-from imu_calibration.kinematics.reference_motion import lever_matrix
+from imu_calibration.kinematics.rotations import lever_matrix
 
 ARM = np.array([0.012, -0.019, 0.004])
 AXES = np.array([[4.1, 0.9], [3.6, 1.3], [3.9, 0.7]])

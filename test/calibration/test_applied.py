@@ -9,13 +9,12 @@ import imu_calibration as imu
 from imu_calibration.calibration.hand_check import prove_readings
 from imu_calibration.calibration.hand_workflow import read_by_hand
 from imu_calibration.calibration.proof import nominal_values
-from imu_calibration.core.constants import DEG
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
+from imu_calibration.core.units import DEG
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.trust import caveats
 from imu_calibration.document.uncorrected import END, MEAN
-from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.effects.term import term
+from imu_calibration.effects.catalogue import CATALOGUE, term
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
 from imu_calibration.use_cases.recordings import Topics, source_of
 from msg_adapters.write import write_session
@@ -73,7 +72,7 @@ def test_check_by_hand_reports_the_error_of_the_compensated_bag(tmp_path):
 def test_the_proof_from_statistics_of_windows_differs_from_that_of_readings_by_the_square_of_the_errors():
     """With the same values for all folds: held-out statistics against corrected readings."""
     from imu_calibration.calibration.proof import prove
-    from imu_calibration.effects.applied import applied_values
+    from imu_calibration.effects.forward_equations import applied_values
     session = imu.simulate('quick', seed=4, effects=['accel_quadratic', 'gyro_g_sensitivity'])
     result = imu.calibrate(session.samples, session.table, accelerometer_model='bias+matrix+accel_size_effect+accel_quadratic',
                            gyroscope_model='bias+matrix+gyro_g_sensitivity', model_as_asked=True).result
@@ -118,7 +117,7 @@ def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third
 def model_output(calibration, time):
     """Return the output of the gyroscope of a calibration at rest at a time, rad/s, shape (3,)."""
     from imu_calibration.effects.forward_equations import sensor_output
-    from imu_calibration.kinematics.reference_motion import Reference
+    from imu_calibration.kinematics.rotations import Reference
     nothing = np.zeros((1, 3))
     ref = Reference(np.array([time]), np.eye(3)[None], nothing, nothing, nothing, 0.0)
     return sensor_output(calibration.model, 'gyroscope', calibration.values, ref=ref)[0]

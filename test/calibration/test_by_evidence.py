@@ -12,7 +12,7 @@ from imu_calibration.calibration import by_evidence
 from imu_calibration.calibration.by_evidence import _moves, stands_out
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.diagnosis.table_diagnosis import told
-from imu_calibration.calibration.model_changes import Demand
+from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table

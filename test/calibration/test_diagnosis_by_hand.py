@@ -14,7 +14,7 @@ from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_l
 from imu_calibration.calibration.diagnosis.hand_diagnosis import diagnose_by_hand
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.kinematics.earth import EARTH_RATE
+from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions

@@ -12,7 +12,7 @@ from imu_calibration.calibration.table_result import _Faster, _Heavier, _Tilted,
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solver import solve
-from imu_calibration.kinematics.perturbed_table import tilt
+from imu_calibration.kinematics.chain import tilt
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile

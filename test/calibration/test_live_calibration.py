@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration import accumulator_state
+from imu_calibration.calibration import collector
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.session import LiveSettings, SolvePacer
 from imu_calibration.calibration.table_calibration import calibrate, conclude, solve_gathered
@@ -143,7 +143,7 @@ def test_a_session_resumed_from_its_state_equals_two_recordings(quick):
     halves = [tuple(cut(s, *part) for s in quick) for part in ((0.0, 0.5), (0.5, 1.0))]
     first = LiveCalibration(TABLE)
     run(first, *halves[0])
-    data = accumulator_state.to_bytes(first.gathered(pending=True), first.model)
+    data = collector.to_bytes(first.gathered(pending=True), first.model)
     second = LiveCalibration(TABLE, saved=data)
     assert second.n_windows > 20
     run(second, *halves[1])
@@ -199,9 +199,9 @@ def test_a_state_comes_back_to_the_last_bit(quick):
     live = LiveCalibration(TABLE)
     run(live, *quick)
     gathered = live.gathered()
-    data = accumulator_state.to_bytes(gathered, live.model)
-    again = accumulator_state.from_bytes(data, live.model)
-    assert accumulator_state.to_bytes(again, live.model) == data
+    data = collector.to_bytes(gathered, live.model)
+    again = collector.from_bytes(data, live.model)
+    assert collector.to_bytes(again, live.model) == data
     found, expected = (conclude(solve_gathered(each, live.model), each, live.model, table=TABLE).calibration for each in (again, gathered))
     assert_same(found, expected, 1e-12)
 
@@ -214,14 +214,14 @@ def test_before_the_first_temperature_there_is_nothing_to_save():
 
 def test_a_state_of_another_model_or_a_broken_one_is_refused(quick):
     live = LiveCalibration(TABLE)
-    data = accumulator_state.to_bytes(live.gathered(), live.model)
+    data = collector.to_bytes(live.gathered(), live.model)
     with refused(DocumentError, 'other_model', 'accel_size_effect'):
-        accumulator_state.from_bytes(data, replace(live.model, accelerometer=('bias', 'matrix')))
+        collector.from_bytes(data, replace(live.model, accelerometer=('bias', 'matrix')))
     with refused(DocumentError, 'other_model', 25, 50):
-        accumulator_state.from_bytes(data, replace(live.model, temperature_ref_c=50.0))
+        collector.from_bytes(data, replace(live.model, temperature_ref_c=50.0))
     for broken in (b'', b'nothing', data[:len(data) // 2], data.replace(b'accumulator/2', b'accumulator/9')):
         with refused(DocumentError, 'accumulator_damaged'):
-            accumulator_state.from_bytes(broken, live.model)
+            collector.from_bytes(broken, live.model)
 
 
 def test_before_any_motion_it_waits_and_says_for_what():

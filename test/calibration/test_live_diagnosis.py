@@ -11,8 +11,8 @@ from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.diagnosis.live_diagnosis import Answer, DiagnosisState, describe, question_about
 from imu_calibration.calibration.diagnosis.table_diagnosis import told
+from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.session import LiveSettings
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.samples import SampleBlock

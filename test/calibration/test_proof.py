@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.document.decision import HELPS, reason_of, worse_regimes
-from imu_calibration.effects.applied import applied_values
 from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.pieces import Regime, moving_pieces

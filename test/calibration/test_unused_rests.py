@@ -2,7 +2,7 @@
 
 import pytest
 
-from imu_calibration.document.statements import WARNING
+from imu_calibration.document.decision import WARNING
 from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 

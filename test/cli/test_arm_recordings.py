@@ -11,7 +11,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, JointSamples
 from imu_calibration.document.files import read_calibration, read_robot_description
-from imu_calibration.kinematics.static_transforms import up_of
+from imu_calibration.kinematics.urdf import up_of
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.use_cases.recordings import Topics
 from imu_calibration.use_cases.simulate import simulate

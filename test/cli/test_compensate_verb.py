@@ -13,7 +13,7 @@ from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.forward_equations import sensor_output
-from imu_calibration.kinematics.reference_motion import Reference, lever_matrix
+from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.signal_history import ThermalBranch
 from msg_adapters.bag import open_recording
 from msg_adapters.imu import FIELDS, parse_imu

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from imu_calibration.calibration.table_check import CheckResult
+from imu_calibration.calibration.table_calibration import CheckResult
 from imu_calibration.core.errors import InputError, with_hint
 from imu_calibration.document import trust
 from imu_calibration.document.calibration_text import calibration_from_text

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from refusal import refused as expected
 
-from imu_calibration.calibration.accumulator_state import saved_model
+from imu_calibration.calibration.collector import saved_model
 from imu_calibration.cli.fleet_run import csv_text, unit_rows
 from imu_calibration.core.documents import from_text
 from imu_calibration.core.errors import DocumentError, InputError

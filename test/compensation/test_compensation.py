@@ -14,7 +14,7 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.forward_equations import predict, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.chain import reference_motion
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 

@@ -10,6 +10,7 @@ from imu_calibration.compensation.health import (
     HARMS,
     HOLDS,
     LEAST,
+    LONGEST,
     MOST_MOVED,
     MOVED,
     UNIT,
@@ -17,10 +18,11 @@ from imu_calibration.compensation.health import (
     CalibrationHealth,
     GyroBiasUpdate,
     HealthOptions,
+    Stop,
+    StopDetector,
     StopWatch,
 )
-from imu_calibration.compensation.stops import LONGEST, Stop, StopDetector
-from imu_calibration.core.constants import DEG
+from imu_calibration.core.units import DEG
 
 from worlds.drives import RATE, SD, G, drive, plain_calibration
 

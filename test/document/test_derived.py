@@ -5,12 +5,12 @@ import pytest
 
 from imu_calibration.calibration.diagnosis.sentences import sentence
 from imu_calibration.calibration.installation_angles import PAIRS, angles_of, derive, in_paper_units, split
-from imu_calibration.core.constants import STANDARD_GRAVITY as G
 from imu_calibration.core.samples import NominalScaling
 from imu_calibration.core.units import NOISE, decimals, for_people, significant, with_sd
+from imu_calibration.core.units import STANDARD_GRAVITY as G
 from imu_calibration.document.calibration import Calibration
+from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.effects.term import term
 from imu_calibration.estimation.status import DETERMINED
 from imu_calibration.papers import zhang2017 as zhang
 from imu_calibration.report.numbers import people

@@ -11,9 +11,8 @@ from refusal import refused
 
 from imu_calibration.core import documents
 from imu_calibration.core.errors import DocumentError, InputError
-from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration import Calibration, implausible
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text, from_mapping, to_mapping
-from imu_calibration.document.plausibility import implausible
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.status import DETERMINED, HELD, WEAK, Status

@@ -11,9 +11,9 @@ from imu_calibration.cli.main import main
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import decision, trust
+from imu_calibration.document.calibration import HAND_AXES
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text, from_mapping, to_mapping
 from imu_calibration.document.decision import HARMS, HELPS, NO_PROOF, UNPROVEN, decide, most_cautious, reason_of
-from imu_calibration.document.reasons import HAND_AXES
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.status import HELD
 from msg_adapters.write import write_session

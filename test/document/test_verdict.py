@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.document.calibration import Calibration, parameter_rows
-from imu_calibration.document.decision import HELPS, UNPROVEN
-from imu_calibration.document.statements import DECISION, NOTE, PARAMETERS, WARNING
+from imu_calibration.document.decision import DECISION, HELPS, NOTE, PARAMETERS, UNPROVEN, WARNING
 from imu_calibration.document.verdict import judge, judged
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.status import DETERMINED, HELD, WEAK, tolerances_of

@@ -9,11 +9,11 @@ import imu_calibration as imu
 from imu_calibration.cli.main import main
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock
 from imu_calibration.document import files, trust
+from imu_calibration.document.calibration import with_nominal
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.decision import HARMS as HARMFUL
 from imu_calibration.document.decision import HELPS, UNPROVEN
 from imu_calibration.document.exports.export import export, find_target
-from imu_calibration.document.nominal import with_nominal
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.kinematics.table import Table
 from msg_adapters.bag import open_recording

@@ -14,25 +14,24 @@ import pytest
 from refusal import refused
 
 import imu_calibration as imu
-from imu_calibration.calibration.accumulator_state import from_bytes, to_bytes
+from imu_calibration.calibration.collector import from_bytes, to_bytes
 from imu_calibration.compensation.kernel import make_kernel
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.effects.base import Effect
-from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.effects.column_group import ColumnGroup
+from imu_calibration.effects.catalogue import CATALOGUE, Catalogue, from_definition, term
+from imu_calibration.effects.expressions import ColumnGroup
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.effects.term import from_definition, term
 from imu_calibration.effects.tolerance_file import rendered
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.rotations import Reference
 
 ROOT = Path(__file__).resolve().parents[2]
 ALSO_WORDS = {'bias', 'matrix'}
 """Names that are plain words too: keys of documents and headings use them."""
-KEYS_ELSEWHERE = {'allan': {'time_constant'}, 'estimation': {'earth_rate'}, 'exports': {'time_offset'}}
+KEYS_ELSEWHERE = {'allan': {'time_constant'}, 'estimation': {'earth_rate'}, 'targets': {'time_offset'}}
 """Package -> words that are keys in its own documents, of noise, of terms of a variance and of other programs, and speak of no effect there."""
 
 
@@ -57,7 +56,7 @@ def spoken_of(path):
 
 def test_no_effect_is_known_by_name_outside_its_package():
     files = [path for path in (ROOT / 'imu_calibration').rglob('*.py') if path.relative_to(ROOT).parts[1] not in ('effects', 'papers')]
-    found = [(path.relative_to(ROOT).parts[1], line) for path in files for line in spoken_of(path)]
+    found = [(path.parent.name, line) for path in files for line in spoken_of(path)]
     assert not [line for package, line in found if line.rpartition(': ')[2] not in KEYS_ELSEWHERE.get(package, ())]
     looked_up = re.compile(rf"(slices|value|has|with_effect|find)[(\[][^()\[\]]*'({'|'.join(ALSO_WORDS)})'|== '({'|'.join(ALSO_WORDS)})'")
     assert not [f'{path.name}: {found[0]}' for path in files if (found := looked_up.search(path.read_text()))]

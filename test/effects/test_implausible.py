@@ -5,8 +5,8 @@ import pytest
 
 import imu_calibration as imu
 from imu_calibration.calibration.diagnosis.live_diagnosis import describe
-from imu_calibration.core.constants import STANDARD_GRAVITY as G
-from imu_calibration.document.plausibility import beyond_known
+from imu_calibration.core.units import STANDARD_GRAVITY as G
+from imu_calibration.document.calibration import beyond_known
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
 

@@ -17,12 +17,10 @@ from imu_calibration.core import documents
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
-from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.effects.column_group import ColumnGroup
-from imu_calibration.effects.expressions import PLACES, read
+from imu_calibration.effects.catalogue import CATALOGUE, term
+from imu_calibration.effects.expressions import PLACES, ColumnGroup, read
 from imu_calibration.effects.sensor_model import BASE, SensorModel
-from imu_calibration.effects.term import term
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values, simulate

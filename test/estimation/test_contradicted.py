@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.accumulator_state import from_bytes, to_bytes
-from imu_calibration.document.verdict_notes import _left_out
+from imu_calibration.calibration.collector import from_bytes, to_bytes
+from imu_calibration.document.verdict import _left_out
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solver import solve

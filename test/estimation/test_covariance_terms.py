@@ -7,7 +7,7 @@ import pytest
 from refusal import refused
 
 import imu_calibration as imu
-from imu_calibration.calibration.model_changes import Demand
+from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.compensation.compensate import invertible_values
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text, from_mapping, to_mapping

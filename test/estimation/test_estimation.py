@@ -6,8 +6,7 @@ from refusal import refused
 
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.effects.columns import References, columns
-from imu_calibration.effects.forward_equations import coefficients, predict
+from imu_calibration.effects.forward_equations import References, coefficients, columns, predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import noise_model
 from imu_calibration.estimation.accumulator import Accumulator, restrict

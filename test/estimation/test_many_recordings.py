@@ -8,8 +8,7 @@ import pytest
 import imu_calibration
 from imu_calibration.calibration.by_evidence import _named_elsewhere
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.effects.columns import columns
-from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.effects.forward_equations import coefficients, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solver import solve

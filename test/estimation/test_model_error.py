@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.accumulator_state import from_bytes, to_bytes
+from imu_calibration.calibration.collector import from_bytes, to_bytes
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import accumulator as accumulator_module

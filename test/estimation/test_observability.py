@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.core.constants import DEG
+from imu_calibration.core.units import DEG
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.observability import (

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from imu_calibration.allan.document import noise_from_text, noise_to_text
 from imu_calibration.allan.identify import figures_of, identify_noise
-from imu_calibration.calibration.accumulator_state import from_bytes, saved_demand, saved_model, to_bytes
+from imu_calibration.calibration.collector import from_bytes, saved_demand, saved_model, to_bytes
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.documents import from_text
@@ -25,7 +25,7 @@ from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, 
 from imu_calibration.document import files
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.exports.export import all_targets, export
-from imu_calibration.document.exports.imported import import_file
+from imu_calibration.document.exports.loss import import_file
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import root_of, table_from_urdf
 from imu_calibration.references.gravity.sample_store import HandStore

@@ -7,8 +7,8 @@ import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.core.constants import STANDARD_GRAVITY
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint import JointLimits, JointNames
 from imu_calibration.kinematics.joint_motion import JointMotion

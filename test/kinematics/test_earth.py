@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.kinematics.earth import EARTH_RATE, earth_rate_n, normal_gravity
+from imu_calibration.kinematics.rotations import EARTH_RATE, earth_rate_n, normal_gravity
 
 
 @pytest.mark.parametrize(('latitude', 'gravity'), [(0.0, 9.7803253359), (45.0, 9.8061977693), (90.0, 9.8321849379)])

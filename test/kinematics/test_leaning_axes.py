@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.chain import WOBBLES, reference_motion, with_axis_angles, with_sag, with_wobble, wobble_at
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.joint_motion import JointMotion, with_encoder_harmonics
-from imu_calibration.kinematics.perturbed_table import WOBBLES, with_axis_angles, with_sag, with_wobble, wobble_at
 from imu_calibration.kinematics.table import Table, axis_error_directions
 
 FIELDS = ('force_s', 'rate_s', 'alpha_s', 'mat_sn')

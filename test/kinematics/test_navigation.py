@@ -5,14 +5,14 @@ import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.core.constants import STANDARD_GRAVITY
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.kinematics import strapdown
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.papers import zhang2017 as zhang
+from imu_calibration.papers import zhang2017 as zhang_claims
 from imu_calibration.papers import zhang2017_joint_fit as zhang_designs
 from imu_calibration.papers import zhang2017_joint_fit as zhang_joint
-from imu_calibration.papers import zhang2017_navigation as zhang_claims
 
 from worlds.figures import show
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.kinematics.static_transforms import StaticTransforms
+from imu_calibration.kinematics.urdf import StaticTransforms
 
 GENERATOR = np.random.default_rng(5)
 STEPS = {('base', 'tower'): 0, ('tower', 'plate'): 1, ('plate', 'imu'): 2, ('base', 'camera'): 3}

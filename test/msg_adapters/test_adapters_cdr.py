@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_typestore
 from test_adapters_bag import make_session
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
+from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.definitions import deserializer, is_standard, standard_definition
 from msg_adapters.encode import encode_imu, encode_joints, encode_temperature

@@ -6,9 +6,9 @@ from refusal import refused
 
 import imu_calibration
 from imu_calibration.cli.main import main
-from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from msg_adapters import csv_bag
 from msg_adapters.bag import open_recording
 from msg_adapters.csv_log import read_csv

@@ -5,8 +5,8 @@ import pytest
 pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 
+from imu_calibration.calibration.coverage import GroupState  # noqa: E402
 from imu_calibration.calibration.diagnosis.live_diagnosis import DiagnosisState  # noqa: E402
-from imu_calibration.calibration.effect_states import GroupState  # noqa: E402
 from imu_calibration.nodes.calibration_guide import PATIENCE, CalibrationGuide  # noqa: E402
 from imu_calibration.nodes.calibration_state import WorkerState  # noqa: E402
 from imu_calibration.nodes.calibration_status import statuses_of  # noqa: E402

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.core.constants import DEG
+from imu_calibration.core.units import DEG
 from imu_calibration.document.calibration_text import calibration_to_text
 from msg_adapters.encode import encode_imu, rows
 from msg_adapters.imu_stream import ImuStream

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
+from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 
 pytest.importorskip('rclpy')
 from refusal import refused

@@ -8,8 +8,7 @@ import yaml
 
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document import files
-from imu_calibration.kinematics.static_transforms import StaticTransforms
-from imu_calibration.kinematics.urdf import table_from_urdf
+from imu_calibration.kinematics.urdf import StaticTransforms, table_from_urdf
 from imu_calibration.planning.situation import noise_of_grade
 from imu_calibration.simulation.sensor_noise import GRADES
 

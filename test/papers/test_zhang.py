@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.core.constants import STANDARD_GRAVITY
 from imu_calibration.core.errors import InputError, NotObservableError
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.papers import zhang2017 as zhang
 from imu_calibration.papers.zhang2017_joint_fit import (
     DESIGNS,

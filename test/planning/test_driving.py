@@ -12,18 +12,16 @@ from refusal import refused
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.estimation.status import DETERMINED
-from imu_calibration.kinematics.motion_limits import MotionLimits
+from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
 from imu_calibration.kinematics.table import Table
-from imu_calibration.kinematics.trajectory_points import TrajectoryPoints
 from imu_calibration.planning.campaign import IN_VAIN, PATIENCE, TIME_OVER, Campaign, CampaignSettings, Suspect, separator_of, with_suspect
 from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
 from imu_calibration.planning.path_watch import PathWatch, at_rest
 from imu_calibration.planning.situation import noise_of_grade
 from imu_calibration.references.options import CalibrationOptions, choose_model
-from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.simulation.table_controller import ControllerSettings, TableController
+from imu_calibration.simulation.table_controller import ControllerSettings, TableController, excess, trajectory_from
 
 STEP = 0.01
 NAMES = ('outer', 'inner')

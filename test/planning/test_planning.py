@@ -14,7 +14,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.effects.columns import columns
+from imu_calibration.effects.forward_equations import columns
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.estimation.status import tolerances_of
 from imu_calibration.estimation.window_statistics import batch_statistics
@@ -23,11 +23,10 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import table_from_urdf
 from imu_calibration.planning import belief
 from imu_calibration.planning.belief import SAMPLING, WindowPredictor, exact_information
+from imu_calibration.planning.campaign import make_separator
 from imu_calibration.planning.coordinates import Coordinates
-from imu_calibration.planning.motions import MotionKind
 from imu_calibration.planning.planner import DONE, make_planner
-from imu_calibration.planning.repertoire import Repertoire
-from imu_calibration.planning.separation import make_separator
+from imu_calibration.planning.repertoire import MotionKind, Repertoire
 from imu_calibration.planning.situation import LEAST_RESTS, Situation, noise_of_grade
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile

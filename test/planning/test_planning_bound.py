@@ -6,10 +6,9 @@ import pytest
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.status import tolerances_of
 from imu_calibration.kinematics.motion_limits import limits_of
-from imu_calibration.planning.belief import additive_bound, exact_information, least_bias_variance
+from imu_calibration.planning.belief import additive_bound, exact_information, least_bias_variance, relax
 from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.planning.planner import make_planner
-from imu_calibration.planning.relaxation import relax
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.situation import Situation, noise_of_grade
 from imu_calibration.references.options import CalibrationOptions, choose_model

@@ -6,9 +6,8 @@ from hypothesis import strategies as st
 
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.motion_limits import limits_of
-from imu_calibration.planning.motions import MotionKind
-from imu_calibration.planning.repertoire import Repertoire, rest_at, up_at
-from imu_calibration.simulation.joint_trajectory import excess, trajectory_from
+from imu_calibration.planning.repertoire import MotionKind, Repertoire, rest_at, up_at
+from imu_calibration.simulation.table_controller import excess, trajectory_from
 
 from worlds.random_tables import random_table
 

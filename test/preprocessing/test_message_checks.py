@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.preprocessing.message_checks import ABSENT, OLD, QUANTITIES, MessageEvidence, check_messages
-from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, WARNING
+from imu_calibration.preprocessing.recording_evidence import ABSENT, GOOD, NOTE, OLD, QUANTITIES, WARNING, MessageEvidence, check_messages
 from msg_adapters.encode import encode_imu, rows
 from msg_adapters.imu_stream import ImuHeads
 

@@ -12,10 +12,8 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.exchanges import _candidates
-from imu_calibration.preprocessing.joint_checks import _rates
-from imu_calibration.preprocessing.on_table import _a_period_late, same_motion, signs_or_delay
-from imu_calibration.preprocessing.standing_still import standing_still
+from imu_calibration.preprocessing.joint_checks import _rates, standing_still
+from imu_calibration.preprocessing.on_table import _a_period_late, _candidates, same_motion, signs_or_delay
 from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.diagnose import diagnose

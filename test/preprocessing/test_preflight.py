@@ -14,11 +14,11 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.block_cleaning import BlockCleaner
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.exchanges import match_axes, signed_permutations
 from imu_calibration.preprocessing.joint_checks import check_force
+from imu_calibration.preprocessing.on_table import match_axes, signed_permutations
 from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING
+from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 from imu_calibration.preprocessing.value_checks import force_error
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import random_values, simulate

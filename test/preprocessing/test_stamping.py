@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from test_rate_slope import PERIOD_NS, START, stamps_of
 
 from imu_calibration.core.samples import ImuSamples, SampleBlock
-from imu_calibration.preprocessing.block_cleaning import BlockCleaner
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.sample_times import SampleTimes
-from imu_calibration.preprocessing.stamping import COUNTED, IRREGULAR, REGULAR, describe_stamps
+from imu_calibration.preprocessing.stamping import COUNTED, IRREGULAR, REGULAR, SampleTimes, describe_stamps
+from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 
 N = 3000
 TRUE = START + PERIOD_NS * np.arange(N)

@@ -6,7 +6,7 @@ from refusal import refused
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.window import WindowSettings
 
 from worlds.cleaning import clean_samples

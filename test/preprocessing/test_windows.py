@@ -10,8 +10,8 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.spike_filter import REACH
-from imu_calibration.preprocessing.static_detector import find_still
 from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.preprocessing.window_cutter import SHORTEST, WanderLimit

@@ -13,9 +13,9 @@ from imu_calibration.calibration.session import LiveByHandSettings
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, NominalScaling
 from imu_calibration.estimation.variance_components import estimate_group_variances, student_factor
-from imu_calibration.kinematics.earth import normal_gravity
-from imu_calibration.kinematics.preintegration import integrate_turn
-from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.kinematics.rotations import normal_gravity
+from imu_calibration.kinematics.strapdown import integrate_turn
+from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.equations import Poses, State, TurnData, build_system, moved
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand

@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.calibration.advice import missing_motion
 from imu_calibration.calibration.hand_workflow import HandRecording, calibrate_samples_by_hand, read_by_hand
-from imu_calibration.core.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock, runs_of
+from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.estimation.covariance_terms import of_fit
 from imu_calibration.estimation.status import reasons_held
-from imu_calibration.kinematics.earth import EARTH_RATE
+from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand, with_weak_replaced

@@ -12,8 +12,8 @@ import pytest
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.core.samples import SampleBlock
+from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.effects.term import term
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.diagnosis_page import cause_of, chance, diagnosis_report, draw_finding, explained_share, variables

@@ -11,7 +11,7 @@ from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_l
 from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose, told
 from imu_calibration.cli.main import main
 from imu_calibration.document import files
-from imu_calibration.effects.column_group import ColumnGroup
+from imu_calibration.effects.expressions import ColumnGroup
 from imu_calibration.selection import proposals
 from imu_calibration.selection.grammar import grammar
 from imu_calibration.selection.investigation import investigate

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.effects.lags import total_lags
+from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.selection import lag_explanations
 from imu_calibration.selection.lag_explanations import COMMON, Explanation, LagExplanations, _Option, _rivals, _told_together, simplest
 from imu_calibration.selection.search import TIE

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.kinematics.chain import reference_motion
-from imu_calibration.kinematics.earth import normal_gravity
-from imu_calibration.kinematics.perturbed_table import tilt
+from imu_calibration.kinematics.chain import reference_motion, tilt
+from imu_calibration.kinematics.rotations import normal_gravity
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 
@@ -326,7 +325,7 @@ def test_session_can_be_written_into_a_bag(tmp_path):
 
 
 def test_the_simulator_does_not_know_what_is_searched_for():
-    allowed = {'imu_calibration', 'imu_calibration.core.samples', 'imu_calibration.core.constants', 'imu_calibration.kinematics.joint_motion',
+    allowed = {'imu_calibration', 'imu_calibration.core.samples', 'imu_calibration.core.units', 'imu_calibration.kinematics.joint_motion',
                'imu_calibration.simulation.profiles', 'imu_calibration.simulation.sensor_noise'}
     for name in ('physics.py', 'physics_draw.py', 'physics_table.py', 'physics_sensor.py'):
         tree = ast.parse((Path(__file__).parents[1] / 'worlds' / name).read_text())

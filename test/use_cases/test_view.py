@@ -19,8 +19,7 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.diagnose import diagnose
-from imu_calibration.use_cases.foxglove_file import PARAMETERS, RESIDUAL, SCHEMAS, SPECTRUM, SPHERE, _from_x, scene_of
-from imu_calibration.use_cases.view import _coverage, view
+from imu_calibration.use_cases.view import PARAMETERS, RESIDUAL, SCHEMAS, SPECTRUM, SPHERE, _coverage, _from_x, scene_of, view
 
 from worlds.hand_sessions import GRAVITY, simulate
 

@@ -15,11 +15,10 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.core.constants import STANDARD_GRAVITY
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock
-from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.core.units import STANDARD_GRAVITY
+from imu_calibration.kinematics.chain import reference_motion, tilt, with_axis_angles, with_axis_places
 from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.perturbed_table import tilt, with_axis_angles, with_axis_places
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import table_from_urdf
 from imu_calibration.simulation.profiles import make_profile

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG
 from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.units import DEG
 
 from worlds.compensation_cases import random_calibration
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG
+from imu_calibration.core.units import DEG
 from imu_calibration.kinematics.joint import Joint, JointLimits
 from imu_calibration.kinematics.table import Table
 

@@ -12,14 +12,14 @@ from imu_calibration.calibration.diagnosis.hand_diagnosis import told_by_hand
 from imu_calibration.calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST
 from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.calibration.diagnosis.traces import residual_traces
+from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.hand_workflow import evident_result, read_by_hand
-from imu_calibration.calibration.model_changes import Demand
 from imu_calibration.calibration.table_calibration import conclude, solve_recordings
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.verdict_notes import unsteady
+from imu_calibration.document.verdict import unsteady
 from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
-from imu_calibration.effects.lags import total_lags
+from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight

@@ -9,9 +9,8 @@ from imu_calibration.calibration.by_evidence import windows_to_ask
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines, in_words, nothing_named
 from imu_calibration.calibration.diagnosis.table_diagnosis import told
-from imu_calibration.calibration.live_snapshot import LiveSnapshot
-from imu_calibration.calibration.model_changes import Demand
-from imu_calibration.calibration.session import TableSession
+from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.session import LiveSnapshot, TableSession
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.selection.evidence import LEAST_WINDOWS
 from imu_calibration.selection.investigation import too_few_windows

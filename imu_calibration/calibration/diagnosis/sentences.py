@@ -5,7 +5,7 @@ from typing import Any
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import Candidate, Finding, parameters_of
 from imu_calibration.core.units import for_people, with_sd
-from imu_calibration.document.plausibility import beyond_known
+from imu_calibration.document.calibration import beyond_known
 from imu_calibration.effects.base import Effect
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.gain import Gain

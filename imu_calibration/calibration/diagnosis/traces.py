@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.columns import INPUT_OF, warped_reference
+from imu_calibration.effects.forward_equations import INPUT_OF, warped_reference
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.strapdown import drift_over

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.effects import regressors
+from imu_calibration.effects import base
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.effects.column_group import ColumnGroup
-from imu_calibration.kinematics.reference_motion import lever_matrix
+from imu_calibration.effects.expressions import ColumnGroup
+from imu_calibration.kinematics.rotations import lever_matrix
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def _both(**kind) -> tuple[Holding, ...]:
 OFFSETS = _both(role=Role.OFFSET)
 MATRICES = _both(role=Role.LINEAR)
 SCALES = _both(role=Role.LINEAR, own_axis=True)
-THERMAL_OFFSETS = _both(groups=(regressors.TEMPERATURE,))
+THERMAL_OFFSETS = _both(groups=(base.TEMPERATURE,))
 G_SENSITIVITY = (Holding('gyroscope', Role.CROSS),)
 ARMS = (Holding('accelerometer', Role.ARMS),)
 SLOW_OFFSETS = OFFSETS + THERMAL_OFFSETS

@@ -1,5 +1,7 @@
-"""The target of an export: one record of all properties of a program, its formula included."""
+"""Target of an export: representable effects, frames, formula, file; text that it writes and reads."""
 
+import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -7,8 +9,133 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from imu_calibration.allan.figures import Densities
+from imu_calibration.core.documents import from_text, to_text
+from imu_calibration.core.errors import InputError, printable, shortened
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.exports.affine import AffineImu, Holding, Placement, as_mounted
+
+XYZ = 'XYZ'
+"""Axes in the names of parameters."""
+
+
+def commented(lines: list[str], mark: str = '# ') -> str:
+    """Return lines as comments; a name in a line cannot end the comment."""
+    return ''.join(f'{mark}{printable(line)}'.rstrip() + '\n' for line in lines)
+
+
+def yaml_file(comments: list[str], mapping: dict, head: str = '') -> str:
+    """Return a YAML file with comments before the content; `head` is a line that must be first."""
+    return head + commented(comments) + to_text(plain(mapping))
+
+
+def plain(value: Any) -> Any:
+    """Return a value with arrays as lists and numpy's numbers as Python's."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def read_yaml(content: bytes, what: str) -> dict:
+    """Return the mapping in a YAML file; the line ``%YAML:1.0`` of OpenCV may precede it."""
+    lines = text_of(content, what).splitlines()
+    kept = '\n'.join(line for line in lines if not line.startswith('%YAML'))
+    return from_text(kept, what)
+
+
+def read_json(content: bytes, what: str) -> dict:
+    """Return the mapping in a JSON file."""
+    try:
+        found = json.loads(text_of(content, what), parse_int=lambda digits: int(digits) if len(digits) < 100 else float(digits))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f'the {what} must be JSON: {shortened(str(error))}; give another file') from error
+    if not isinstance(found, dict):
+        raise InputError(f'the {what} must hold a mapping, got {type(found).__name__}; give another file')
+    return found
+
+
+def text_of(content: bytes, what: str) -> str:
+    """Return a file's text."""
+    try:
+        return content.decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f'the {what} must be a text file, it is none; give another file') from error
+
+
+def numbers_at(mapping: dict, name: str, shape: tuple[int, ...], *, what: str) -> np.ndarray:
+    """
+    Return an entry of a mapping as an array.
+
+    Raises
+    ------
+    InputError
+        When it is missing, or not finite numbers of that shape.
+
+    """
+    try:
+        array = np.asarray(mapping[name], float)
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise InputError(f"the {what} must have '{name}', numbers of shape {shape}, got {shortened(repr(mapping.get(name)))}; "
+                         'correct it') from error
+    if array.size != np.prod(shape, dtype=int) or not np.all(np.isfinite(array)):
+        raise InputError(f"'{name}' of the {what} must be finite numbers of shape {shape}, got {shortened(repr(mapping[name]))}; "
+                         'correct it')
+    return array.reshape(shape)
+
+
+def section(mapping: dict, name: str, what: str) -> dict:
+    """Return a mapping in a mapping."""
+    found = mapping.get(name)
+    if not isinstance(found, dict):
+        raise InputError(f"the {what} must have a section '{name}', got {shortened(repr(found))}; give another file")
+    return found
+
+
+def read_parameters(content: bytes, what: str) -> dict[str, float]:
+    """
+    Return {name: value} from a list of parameters, one a line, comments after ``#``.
+
+    The last field of a line is the value in ArduPilot's lists (``NAME,VALUE``), the fourth in QGroundControl's
+    (``vehicle component NAME VALUE type``).
+    """
+    found = {}
+    for line in text_of(content, what).splitlines():
+        words = re.split(r'[\s,=]+', line.partition('#')[0].strip())
+        name = next((k for k, word in enumerate(words) if re.fullmatch(r'[A-Z][A-Z0-9_]+', word)), None)
+        if name is None or name + 1 >= len(words):
+            continue
+        try:
+            found[words[name]] = float(words[name + 1])
+        except ValueError as error:
+            raise InputError(f"the {what} must give '{words[name]}' a number, got {shortened(words[name + 1])}; correct it") from error
+    if not found:
+        raise InputError(f'the {what} must hold parameters, one NAME and value a line, it holds none; give another file')
+    return found
+
+
+def vector_of(found: dict[str, float], name: str, missing: float = 0.0) -> np.ndarray:
+    """Return the parameters of the three axes, whose letter replaces ``*`` in the name, shape (3,)."""
+    return np.array([found.get(name.replace('*', axis), missing) for axis in XYZ])
+
+
+def refuse_curved(found: dict[str, float], beginnings: list[str]) -> None:
+    """
+    Refuse thermal polynomials of an order that the catalogue does not have.
+
+    Raises
+    ------
+    InputError
+        When a parameter with one of these beginnings is not zero.
+
+    """
+    curved = [name for name, value in found.items() if name.startswith(tuple(beginnings)) and value]
+    if curved:
+        raise InputError(f'thermal offsets must be linear in the temperature to be read, got {curved[0]} = {found[curved[0]]:g}; '
+                         'set it to 0, or calibrate with a temperature topic', code='not_linear')
+
 
 Numbers = dict[str, Any]
 """Name in the file -> number, list or mapping, in the units of the program."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import fdtrc
 
-from imu_calibration.core.constants import DEG, STANDARD_GRAVITY
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
 from imu_calibration.references.gravity.equations import Poses
 from imu_calibration.references.gravity.hand_parameters import ACCELEROMETER, GYRO_BIAS, HandModel

@@ -7,8 +7,8 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.sensor_model import BASE
-from imu_calibration.kinematics.preintegration import integrate_turn
-from imu_calibration.kinematics.reference_motion import skew
+from imu_calibration.kinematics.rotations import skew
+from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.references.gravity.equations import TurnData, between_middles, tangent
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_calibration import HandCalibration

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.kinematics.preintegration import integrate_turn, small_rotation
-from imu_calibration.kinematics.reference_motion import skew
+from imu_calibration.kinematics.rotations import skew
+from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import GYRO_BIAS, GYRO_MATRIX, LOWER, HandModel, unpack
 
 COMPONENTS = ('pose', 'drift', 'turn')

@@ -4,7 +4,7 @@ import numpy as np
 import scipy.linalg
 from scipy.special import fdtrc
 
-from imu_calibration.kinematics.earth import EARTH_RATE
+from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.references.gravity.equations import Poses
 
 SPARE = 8

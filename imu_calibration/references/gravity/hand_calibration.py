@@ -14,7 +14,7 @@ from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
 from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, Terms, replace_weak, sd_without, total, with_term
 from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.estimation.status import FIXED, HELD, statuses
-from imu_calibration.preprocessing.static_detector import find_still
+from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import bias_movements, with_movement, without_movement
 from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown

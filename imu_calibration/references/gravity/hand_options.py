@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, field
 
-from imu_calibration.core.constants import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import setting
+from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.sensor_model import parse_effects

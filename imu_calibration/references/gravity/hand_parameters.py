@@ -10,7 +10,7 @@ from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import effect_slopes
 from imu_calibration.effects.sensor_model import SensorModel, linear_names
 from imu_calibration.estimation.status import tolerances_of
-from imu_calibration.kinematics.reference_motion import Reference
+from imu_calibration.kinematics.rotations import Reference
 
 LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
 """Free entries of the accelerometer matrix under the gauge."""

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
-from imu_calibration.core.regular_files import load_arrays
 from imu_calibration.core.samples import ImuSamples
 
 FORMAT = 'imu_calibration/hand_samples/1'

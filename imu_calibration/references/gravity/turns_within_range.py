@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imu_calibration.kinematics.preintegration import integrate_turn
+from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.preprocessing.full_scale import LEAST_TURNS, MOST_TURNS, believed_factor
 from imu_calibration.references.gravity.equations import Poses, State, TurnData
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.effects.columns import columns
+from imu_calibration.effects.forward_equations import columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.pieces import pieces_at_rest
 from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_window

@@ -6,8 +6,18 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.exports.affine import OFFSETS, SCALES, THERMAL_OFFSETS, AffineImu, forward_right_down, of
-from imu_calibration.document.exports.target import Page, Read, Readings, Target
-from imu_calibration.document.exports.text import XYZ, commented, plain, read_parameters, refuse_curved, vector_of
+from imu_calibration.document.exports.target import (
+    XYZ,
+    Page,
+    Read,
+    Readings,
+    Target,
+    commented,
+    plain,
+    read_parameters,
+    refuse_curved,
+    vector_of,
+)
 from imu_calibration.effects.base import SENSORS
 
 OFFSET = {'accelerometer': 'INS_ACCOFFS', 'gyroscope': 'INS_GYROFFS'}

@@ -7,8 +7,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError, shortened
 from imu_calibration.document.exports.affine import OFFSETS, SCALES, AffineImu, of
-from imu_calibration.document.exports.target import Noise, Page, Read, Readings, Target
-from imu_calibration.document.exports.text import numbers_at, read_yaml, section, yaml_file
+from imu_calibration.document.exports.target import Noise, Page, Read, Readings, Target, numbers_at, read_yaml, section, yaml_file
 
 AXES = 'xyz'
 TOPIC = 'gyro_scale_input'

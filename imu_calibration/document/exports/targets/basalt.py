@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.document.exports.affine import MATRICES, OFFSETS, THERMAL_OFFSETS, AffineImu, accelerometer_lower
-from imu_calibration.document.exports.target import Noise, Page, Read, Readings, Target
-from imu_calibration.document.exports.text import numbers_at, plain, read_json, section
+from imu_calibration.document.exports.target import Noise, Page, Read, Readings, Target, numbers_at, plain, read_json, section
 
 LOWER_BY_COLUMNS = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
 

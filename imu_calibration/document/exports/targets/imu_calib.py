@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.document.exports.affine import MATRICES, OFFSETS, AffineImu, of
-from imu_calibration.document.exports.target import Page, Read, Readings, Target
-from imu_calibration.document.exports.text import numbers_at, read_yaml, yaml_file
+from imu_calibration.document.exports.target import Page, Read, Readings, Target, numbers_at, read_yaml, yaml_file
 
 
 def numbers(imu: AffineImu) -> dict:

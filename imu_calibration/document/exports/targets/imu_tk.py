@@ -6,8 +6,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.exports.affine import MATRICES, OFFSETS, AffineImu, of
-from imu_calibration.document.exports.target import Read, Readings, Target
-from imu_calibration.document.exports.text import text_of
+from imu_calibration.document.exports.target import Read, Readings, Target, text_of
 
 ENDINGS = {'accelerometer': '.acc', 'gyroscope': '.gyro'}
 COUNT = 21

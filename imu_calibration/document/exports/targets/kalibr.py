@@ -16,10 +16,9 @@ from imu_calibration.document.exports.affine import (
     accelerometer_lower_at_x,
     lower_times_rotation,
 )
-from imu_calibration.document.exports.target import Noise, Page, Read, Readings, Target
-from imu_calibration.document.exports.text import numbers_at, read_yaml, section, yaml_file
+from imu_calibration.document.exports.target import Noise, Page, Read, Readings, Target, numbers_at, read_yaml, section, yaml_file
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.kinematics.reference_motion import lever_matrix
+from imu_calibration.kinematics.rotations import lever_matrix
 
 STEPS = 30
 """Fixed-point steps of the inversion: arms and g-sensitivity feel one another through small numbers."""

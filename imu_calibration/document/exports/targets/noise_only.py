@@ -2,10 +2,9 @@
 
 from functools import partial
 
-from imu_calibration.core.constants import STANDARD_GRAVITY
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.exports.affine import SLOW_OFFSETS
-from imu_calibration.document.exports.target import Noise, Page, Target
-from imu_calibration.document.exports.text import yaml_file
+from imu_calibration.document.exports.target import Noise, Page, Target, yaml_file
 
 
 def _gravity(page: Page) -> float:

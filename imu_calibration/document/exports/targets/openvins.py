@@ -13,9 +13,8 @@ from imu_calibration.document.exports.affine import (
     lower_times_rotation,
     upper_times_rotation,
 )
-from imu_calibration.document.exports.target import Page, Read, Readings, Target
+from imu_calibration.document.exports.target import Page, Read, Readings, Target, numbers_at, read_yaml, section, yaml_file
 from imu_calibration.document.exports.targets.kalibr import noise, read_densities
-from imu_calibration.document.exports.text import numbers_at, read_yaml, section, yaml_file
 
 SHAPES = {'lower': lower_times_rotation, 'upper': upper_times_rotation}
 NAMES = ('Tw', 'R_IMUtoGYRO', 'Ta', 'R_IMUtoACC', 'Tg')

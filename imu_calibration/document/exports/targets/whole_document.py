@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.document.exports.target import Page, Read, Target
-from imu_calibration.document.exports.text import plain, read_json
+from imu_calibration.document.exports.target import Page, Read, Target, plain, read_json
 from imu_calibration.effects.base import SENSORS
 
 HEADER = b'MATLAB 5.0 MAT-file'

@@ -1,0 +1,363 @@
+"""One pass over a recording in chunks: rest, and parts with frozen output."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.core.samples import runs_of
+
+CHUNK_TIME = 0.25
+"""s; short against turns by hand, long against the period of the samples."""
+LEAST, MOST = 8, 2048
+"""Samples per chunk."""
+FIRST = 200
+"""Samples from which the period is estimated."""
+CAPACITY = 40_000
+"""Chunks kept, nearly three hours; later samples are counted but not checked."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chunks:
+    """Chunks in order of time; columns are force x, y, z, then rate x, y, z."""
+
+    time: np.ndarray
+    """Mean stamp, s since the first sample, shape (n,)."""
+    duration: np.ndarray
+    """Mean step times the number of samples, s, shape (n,)."""
+    mean: np.ndarray
+    """Shape (n, 6)."""
+    sd: np.ndarray
+    """Shape (n, 6)."""
+    range: np.ndarray
+    """Largest minus smallest, shape (n, 6)."""
+    size: int
+    """Samples per chunk."""
+    first_ns: int = 0
+    """Stamp of the first sample, where `time` is zero."""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def select(self, keep: np.ndarray) -> 'Chunks':
+        """Return the chunks at a mask."""
+        return replace(self, **{name: getattr(self, name)[keep] for name in ('time', 'duration', 'mean', 'sd', 'range')})
+
+
+class ChunkSeries:
+    """
+    Cuts clean samples into chunks of equal number; how the stream was cut into blocks does not matter.
+
+    Parameters
+    ----------
+    chunk_time : float
+        Wanted length of a chunk, s.
+    capacity : int
+        Chunks kept.
+
+    """
+
+    def __init__(self, chunk_time: float = CHUNK_TIME, capacity: int = CAPACITY):
+        self.size, self._chunk_time, self._capacity = None, chunk_time, capacity
+        self.n_samples = 0
+        self.n_changed = np.zeros(6, np.int64)
+        self.n_repeated = 0
+        self._rest: tuple[np.ndarray, np.ndarray] | None = None
+        self._first_ns, self._last = None, None
+        self._parts, self._n_chunks = [], 0
+
+    def push(self, stamp_ns: np.ndarray, columns: np.ndarray) -> None:
+        """Process clean samples of one epoch of the clock: stamps, shape (n,), and force and rate, shape (6, n)."""
+        self._count_changes(columns)
+        if self._rest is not None:
+            stamp_ns, columns = np.concatenate([self._rest[0], stamp_ns]), np.concatenate([self._rest[1], columns], axis=1)
+        self._rest = (stamp_ns, columns)
+        if self.size is None and len(stamp_ns) >= FIRST:
+            self.size = _size(stamp_ns, self._chunk_time)
+        if self.size is not None:
+            self._cut()
+
+    def chunks(self) -> Chunks:
+        """Return the Chunks until now."""
+        if self.size is None and self._rest is not None and len(self._rest[0]) > LEAST:
+            self.size = _size(self._rest[0], self._chunk_time)
+            self._cut()
+        parts = self._parts or [(np.zeros(0), np.zeros(0), *(np.zeros((0, 6)) for _ in range(3)))]
+        time, duration, mean, sd, extent = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return Chunks(time, duration, mean, sd, extent, self.size or LEAST, int(self._first_ns or 0))
+
+    def _count_changes(self, columns):
+        if self._last is not None:
+            changed = columns[:, :1] != self._last
+            self.n_changed += changed[:, 0]
+            self.n_repeated += not changed.any()
+        changed = columns[:, 1:] != columns[:, :-1]
+        self.n_changed += np.count_nonzero(changed, axis=1)
+        self.n_repeated += changed.shape[1] - int(np.count_nonzero(changed.any(axis=0)))
+        self.n_samples += columns.shape[1]
+        self._last = columns[:, -1:].copy()
+
+    def _cut(self):
+        stamp_ns, columns = self._rest
+        n = len(stamp_ns) // self.size
+        used = n * self.size
+        self._rest = stamp_ns[used:].copy(), columns[:, used:].copy()
+        if not n or self._n_chunks >= self._capacity:
+            return
+        if self._first_ns is None:
+            self._first_ns = stamp_ns[0]
+        self._parts.append(_describe(((stamp_ns[:used] - self._first_ns) * 1e-9).reshape(n, self.size),
+                                     columns[:, :used].reshape(6, n, self.size)))
+        self._n_chunks += n
+
+
+def _size(stamps, chunk_time):
+    period = float(np.median(np.diff(stamps[:FIRST]))) * 1e-9
+    return int(np.clip(round(chunk_time / max(period, 1e-6)), LEAST, MOST))
+
+
+def _describe(time, values):
+    start = values[:, :, :1].copy()
+    values = values - start   # avoids cancellation with large offsets
+    mean = values.mean(axis=2)
+    sd = np.sqrt(np.maximum(np.einsum('ijk,ijk->ij', values, values) / values.shape[2] - mean**2, 0.0))
+    size = time.shape[1]
+    spread = values.max(axis=2) - values.min(axis=2)
+    return time.mean(axis=1), (time[:, -1] - time[:, 0]) * size / (size - 1), (mean + start[:, :, 0]).T, sd.T, spread.T
+
+
+LEAST_CHUNKS = 4
+STILL = 0.02
+"""Largest turn of the measured gravity from one chunk to the next, rad."""
+
+
+LEAST_POSES = 9
+LEAST_FACES = 6
+FARTHEST = 0.8
+"""Bias in units of gravity from which on readings are no sphere but counts with an offset."""
+LEAST_SPREAD = 0.05
+"""Smallest eigenvalue of the scatter of directions (1/3 when they are even) above which poses separate bias from length."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """Readings while steady: at rest, or in a rotation with constant direction of gravity."""
+
+    force: np.ndarray
+    """Mean specific force in each steady stretch, shape (n_stretches, 3)."""
+    rate: np.ndarray
+    """Median of the mean rate, shape (3,)."""
+    range: np.ndarray
+    """Median over the chunks at rest of largest minus smallest, force then rate, shape (6,); 0 where the noise does not show."""
+    ranges: np.ndarray
+    """First chunk of each stretch and the one after its last, shape (n_stretches, 2)."""
+
+    @property
+    def norm(self) -> np.ndarray:
+        """Length of the specific force in each stretch, shape (n_stretches,)."""
+        return np.linalg.norm(self.force, axis=1)
+
+    @property
+    def sphere(self) -> tuple[np.ndarray, float] | None:
+        """Centre (the bias) and radius of the sphere on which the readings of many poses lie, or None."""
+        return self._sphere() if len(self.force) >= LEAST_POSES else None
+
+    @property
+    def bias(self) -> np.ndarray | None:
+        """Bias of the accelerometer, to a tenth of gravity or so, where six faces or more show it, or None."""
+        found = self._sphere() if len(self.force) >= LEAST_FACES else None
+        return None if found is None else found[0]
+
+    def _sphere(self):
+        scaled = self.force / np.median(self.norm)
+        design = np.column_stack([2 * scaled, np.ones(len(scaled))])
+        *centre, rest = np.linalg.lstsq(design, (scaled**2).sum(axis=1), rcond=None)[0]
+        centre = np.array(centre)
+        directions = (scaled - centre) / np.maximum(np.linalg.norm(scaled - centre, axis=1, keepdims=True), 1e-9)
+        spread = np.linalg.eigvalsh(np.cov(directions.T))[0]
+        if spread < LEAST_SPREAD or np.linalg.norm(centre) > FARTHEST:
+            return None
+        return centre * np.median(self.norm), float(np.sqrt(rest + centre @ centre) * np.median(self.norm))
+
+    @property
+    def length(self) -> float:
+        """Gravity in the units of the accelerometer: the radius of the sphere, else the median length."""
+        return float(np.median(self.norm)) if self.sphere is None else self.sphere[1]
+
+
+def find_rest(chunks: Chunks) -> Rest | None:
+    """Return the `Rest` of Chunks, or None when the sensor never rests (see `still_chunks`)."""
+    still = still_chunks(chunks)
+    if still.sum() < LEAST_CHUNKS:
+        return None
+    runs = _stretches(still)
+    force = np.array([chunks.mean[a:b, :3].mean(axis=0) for a, b in runs])
+    return Rest(force, np.median(chunks.mean[still, 3:], axis=0), np.median(chunks.range[still], axis=0), runs)
+
+
+def still_chunks(chunks: Chunks) -> np.ndarray:
+    """
+    Return in which chunks the sensor is at rest, bool, shape (n,).
+
+    At rest both sensors scatter as little as in the quietest tenth, and gravity keeps its direction. Both are relative, so that
+    counts and g do as well as m/s^2.
+    """
+    if len(chunks) < LEAST_CHUNKS:
+        return np.zeros(len(chunks), bool)
+    quiet = np.ones(len(chunks), bool)
+    for part in (slice(0, 3), slice(3, 6)):
+        scatter = np.linalg.norm(chunks.sd[:, part], axis=1)
+        quiet &= scatter <= 3.0 * np.quantile(scatter, 0.1) + 1e-3 * np.median(scatter)
+    direction = chunks.mean[:, :3] / np.maximum(np.linalg.norm(chunks.mean[:, :3], axis=1, keepdims=True), 1e-12)
+    turn = np.linalg.norm(np.diff(direction, axis=0), axis=1)
+    still = quiet & (np.append(turn, 0.0) < STILL) & (np.append(0.0, turn) < STILL)
+    if still.sum() < LEAST_CHUNKS:
+        return still
+    rate = np.median(chunks.mean[still, 3:], axis=0)
+    away = np.linalg.norm(chunks.mean[:, 3:] - rate, axis=1)
+    # A spin at constant rate about the vertical is as quiet as rest, but has rates.
+    return still & (away <= np.maximum(0.05 * away.max(), 3.0 * np.median(np.linalg.norm(chunks.sd[still, 3:], axis=1))))
+
+
+def _stretches(still):
+    runs = runs_of(still)
+    long = runs[np.ptp(runs, axis=1) >= 2]
+    return long if len(long) else runs
+
+
+SENSOR_COLUMNS = {'accelerometer': slice(0, 3), 'gyroscope': slice(3, 6)}
+LONG = 4
+"""Chunks, one second."""
+STEPS = 2.0
+"""A sensor with a noise at rest of at least this many converter steps in a chunk is not constant on three axes for a second."""
+TURNS = 0.1
+"""Mean rate of a chunk from which on the IMU turns, rad/s."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrozenPart:
+    """One stretch without new readings."""
+
+    who: str
+    """'accelerometer', 'gyroscope' or 'joints'."""
+    start: float
+    """s since the first Imu sample."""
+    stop: float
+    """The same, of its end."""
+    samples: int
+    """Imu samples in it."""
+
+
+def long_runs(flags: np.ndarray) -> np.ndarray:
+    """Return (start, stop) of the runs of at least `LONG` true flags, shape (n, 2)."""
+    runs = runs_of(flags)
+    return runs[np.ptp(runs, axis=1) >= LONG]
+
+
+def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarray]:
+    """
+    Return sensor -> which chunks it is frozen in, bool, shape (n,).
+
+    A sensor with visible noise at rest never repeats one reading on three axes for a second. A sensor with steps coarser than its noise,
+    or without noise, does so at every rest: the constant stretches then outnumber the rests with noise, and none is reported.
+
+    Parameters
+    ----------
+    chunks : Chunks
+        Of the whole recording.
+    resolution : array, shape (6,)
+        Smallest step between readings of each column.
+
+    """
+    flat = {sensor: (chunks.range[:, part] == 0).all(axis=1) for sensor, part in SENSOR_COLUMNS.items()}
+    runs = {sensor: long_runs(flags) for sensor, flags in flat.items()}
+    found = {sensor: np.zeros(len(chunks), bool) for sensor in SENSOR_COLUMNS}
+    if not any(map(len, runs.values())):
+        return found
+    rest = find_rest(chunks.select(~np.logical_or(*flat.values())))
+    if rest is None:
+        return found
+    for sensor, part in SENSOR_COLUMNS.items():
+        noisy = (rest.range[part] >= STEPS * resolution[part]).all() and (rest.range[part] > 0).all()
+        if noisy and len(runs[sensor]) <= len(rest.force):
+            for start, stop in runs[sensor]:
+                found[sensor][start:stop] = True
+    return found
+
+
+def frozen_parts(chunks: Chunks, frozen: dict[str, np.ndarray]) -> list[FrozenPart]:
+    """Return the stretches of `frozen_chunks` in order of time."""
+    parts = [_part(chunks, sensor, start, stop) for sensor, flags in frozen.items() for start, stop in long_runs(flags)]
+    return sorted(parts, key=lambda part: part.start)
+
+
+def frozen_joints(chunks: Chunks, still_ns: np.ndarray, rate_at_rest: np.ndarray) -> list[FrozenPart]:
+    """
+    Return the stretches in which all joint positions are constant for a second while the IMU turns.
+
+    Parameters
+    ----------
+    chunks : Chunks
+        Without chunks in which the gyroscope is frozen.
+    still_ns : array, shape (n, 2)
+        First and last stamp of each stretch in which no joint position changes.
+    rate_at_rest : array, shape (3,)
+        Reading of the gyroscope at rest, rad/s; its most frequent reading with constant joints if that explains more (spins about
+        the vertical are as steady as rests).
+
+    """
+    inside = np.zeros(len(chunks), bool)
+    for start, stop in (still_ns - chunks.first_ns) * 1e-9:
+        inside |= (chunks.time - chunks.duration / 2 >= start) & (chunks.time + chunks.duration / 2 <= stop)
+    if not inside.any():
+        return []
+    rates = chunks.mean[:, 3:]
+    turning = min((np.linalg.norm(rates - rate, axis=1) > TURNS for rate in (rate_at_rest, np.median(rates[inside], axis=0))),
+                  key=lambda flags: np.count_nonzero(flags & inside))
+    return [_part(chunks, 'joints', start, stop) for start, stop in long_runs(turning & inside)]
+
+
+def _part(chunks, who, start, stop):
+    return FrozenPart(who, float(chunks.time[start] - chunks.duration[start] / 2),
+                      float(chunks.time[stop - 1] + chunks.duration[stop - 1] / 2),
+                      int((stop - start) * chunks.size))
+
+
+class StandingJoints:
+    """Notes, in bounded memory, in which stretches of more than half a second no joint position changes."""
+
+    LEAST_NS = 500_000_000
+    CAPACITY = 10_000
+
+    def __init__(self) -> None:
+        self._found: list[tuple[int, int]] = []
+        self._last: np.ndarray | None = None
+        self._since, self._until = 0, 0
+
+    def push(self, stamp_ns: np.ndarray, position: np.ndarray) -> None:
+        """Process joint samples in order: stamps, shape (n,), and positions, shape (n, n_joints)."""
+        if self._last is not None and len(self._last) != position.shape[1]:
+            self._close()
+            self._last = None
+        before = position[:1] if self._last is None else self._last[None]
+        changed = np.any(position != np.concatenate([before, position[:-1]]), axis=1)
+        if self._last is None:
+            changed[0] = True
+        starts = np.flatnonzero(changed)
+        for k, start in enumerate(starts):
+            if k == 0 and start > 0:
+                self._until = int(stamp_ns[start - 1])
+            self._close()
+            stop = starts[k + 1] if k + 1 < len(starts) else len(stamp_ns)
+            self._since, self._until = int(stamp_ns[start]), int(stamp_ns[stop - 1])
+        if not len(starts):
+            self._until = int(stamp_ns[-1])
+        self._last = position[-1].copy()
+
+    def stretches(self) -> np.ndarray:
+        """Return first and last stamp of each stretch until now, shape (n, 2)."""
+        open_one = [] if self._until - self._since < self.LEAST_NS else [(self._since, self._until)]
+        return np.array(self._found + open_one, np.int64).reshape(-1, 2)
+
+    def _close(self):
+        if self._until - self._since >= self.LEAST_NS and len(self._found) < self.CAPACITY:
+            self._found.append((self._since, self._until))
