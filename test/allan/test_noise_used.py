@@ -37,6 +37,8 @@ from worlds import physics
 from worlds.compensation_cases import random_calibration
 from worlds.noise_worlds import flicker
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 BAG = Path(__file__).parents[2] / 'bags' / 'sample_session'
 
 

@@ -157,15 +157,15 @@ def test_no_motion_and_no_overlap_are_refused():
         estimate_arm(imu_a, imu_b.select(slice(0, 5)))
 
 
-BOARD_MM = {1: (-9.45, 9.45, 1.0), 3: (-9.45, -9.45, 1.0), 5: (9.45, 9.45, 1.0), 7: (9.45, -9.45, 1.0)}
-PAIRS = ((1, 3), (1, 7), (3, 5), (3, 7))
+BOARD_MM = {1: (-9.45, 9.45, 1.0), 3: (-9.45, -9.45, 1.0), 7: (9.45, -9.45, 1.0)}
+PAIRS = ((1, 3), (1, 7), (3, 7))
 
 
 @pytest.mark.long
 @pytest.mark.real_data
-def test_boards_of_four_imus(recordings):
+def test_boards_of_several_imus(recordings):
     """
-    Four of the six pairs (`make validate` has all): within 1 mm of the board's design and 0.5 mm of itself in the other recording, per axis.
+    Three of four IMUs in pairs (`make validate` has all): within 1 mm of the board's design and 0.5 mm of itself in the other recording, per axis.
 
     The sd reported is 0.08-0.16 mm per axis; the design does not say where in the package the sensitive points are.
     """

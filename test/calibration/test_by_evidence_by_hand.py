@@ -21,7 +21,7 @@ ROWS = slice(12, 21)
 @pytest.fixture(scope='module')
 def bent():
     """A session with gyroscopes whose output bends with the rate, and the true parameters."""
-    samples, _, truth = simulate(31, n_poses=36, spoil=HIDDEN[QUADRATIC])
+    samples, _, truth = simulate(31, n_poses=24, spoil=HIDDEN[QUADRATIC])
     return samples, truth
 
 

@@ -45,7 +45,7 @@ def stops(force, rate, time, pose):
     return steps[pose], NOTHING
 
 
-def diagnosed(seed, spoil=None, n_poses=36, **options):
+def diagnosed(seed, spoil=None, n_poses=24, **options):
     imu, ranges, _ = simulate(seed, n_poses=n_poses, spoil=spoil, **options)
     return diagnose_by_hand(gather_by_hand(imu, ranges), HandOptions(GRAVITY))
 
@@ -63,7 +63,7 @@ def test_a_hidden_effect_is_found_and_its_gain_measured(name, responding):
     assert found.findings, [(c.effect, c.gain_alone, c.p_value_alone, c.verdict) for c in found.candidates[:4]]
     first = found.findings[0]
     assert name in (first.effect, *first.indistinguishable_from)
-    assert first.gain.ci95[0] > 0 and first.gain.windows >= 35
+    assert first.gain.ci95[0] > 0 and first.gain.windows >= 23
     assert len(found.findings) == 1
 
 
@@ -71,13 +71,13 @@ def test_the_attitudes_at_which_a_rest_appears_are_told():
     """A gyroscope whose bias is another one while y is level: no effect of the catalogue; beside a bias of every stop no place is told."""
     def spoil(f, w, t, k):
         return NOTHING, np.outer(np.abs(f[:, 1]) < 3.0, [0.0, 0.3 * DEG, 0.0])
-    diagnosis = diagnosed(21500, spoil, n_poses=24).diagnosis
+    diagnosis = diagnosed(21500, spoil).diagnosis
     rest = diagnosis.unexplained['gyroscope']
     assert not diagnosis.findings and rest.axes == ('y',) and len(rest.regimes) == 1
     regime = rest.regimes[0]
     assert regime.axis == 'y' and regime.variable == 'specific force along y' and -4.5 < regime.bounds[0] < -1.5 and 1.5 < regime.bounds[1] < 4.5
     assert any(regime.variable in line and 'gyroscope y' in line for line in diagnosis_lines(diagnosis))
-    everywhere = diagnosed(21500, stops, n_poses=24).diagnosis.unexplained['accelerometer']
+    everywhere = diagnosed(21500, stops).diagnosis.unexplained['accelerometer']
     assert everywhere.significant and not everywhere.regimes
 
 

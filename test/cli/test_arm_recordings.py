@@ -21,6 +21,8 @@ from msg_adapters.write import write_session
 
 from worlds.arms import SIX_AXES, joint, robot
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 TWO_AXES = robot(joint('tilt', 'base_link', 'frame', '0 0 0.5', axis='0 1 0'), joint('plate', 'frame', 'imu_link', '0 0 0.1', kind='continuous'))
 XACRO = '''<?xml version="1.0"?>
 <robot name="own" xmlns:xacro="http://www.ros.org/wiki/xacro">

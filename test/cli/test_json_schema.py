@@ -12,6 +12,8 @@ from imu_calibration.cli import parser, watch
 from imu_calibration.cli.main import json_text, main
 from imu_calibration.cli.watch import NodeStatus
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
 SESSION, TABLE, TRUTH = (f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml'))
 with open(f'{ROOT}/docs/cli.schema.json', encoding='utf8') as schema_file:

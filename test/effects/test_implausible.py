@@ -12,6 +12,8 @@ from imu_calibration.kinematics.table import Table
 
 from worlds import physics
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 CUBIC = np.array([8e-3, -6e-3, 7e-3]) / G**2
 """8 mg at 1 g: what saturates looks like that, and no accelerometer is."""
 NAMES = [f'accelerometer.accel_cubic.{axis}' for axis in 'xyz']

@@ -54,7 +54,7 @@ def test_a_driver_that_publishes_g_is_told_the_unit(bench, tmp_path):
     node = start(bench, tmp_path)
     converted(node, [bytes(row) for row in rows(encode_imu(replace(WORLD.imu, force_s=WORLD.imu.force_s / 9.80665)))])
     bench.until(lambda: bench.lines().get(STATUS, (OK,))[0] == ERROR, 'an error')
-    assert bench.figure(STATUS, 'outcome') == 'unit' and bench.heard('unit is g', level='error') == 1 and not bench.heard(level='warning')
+    assert bench.figure(STATUS, 'outcome') == 'unit' and bench.heard('m/s^2', level='error') == 1 and not bench.heard(level='warning')
 
 
 def test_an_update_is_taken_off_where_it_is_allowed_and_its_uncertainty_is_published(bench, tmp_path):

@@ -12,6 +12,8 @@ from imu_calibration.simulation.session import SimulationOptions, random_values,
 from imu_calibration.use_cases.resources import config_file
 from msg_adapters.write import write_session
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 TABLE_FILE = config_file('table_simulated.yaml')
 TABLE = Table.from_mapping(yaml.safe_load(TABLE_FILE.read_text(encoding='utf-8')))
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names))

@@ -20,6 +20,8 @@ from imu_calibration.use_cases.diagnose import diagnose
 
 from worlds.misfit_worlds import make_pair
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 
 @pytest.fixture(scope='module')
 def gimbals():

@@ -14,6 +14,8 @@ from imu_calibration.use_cases.provenance import made_from, provenance_with, req
 from imu_calibration.use_cases.resources import config_file
 from imu_calibration.use_cases.stand import Arm
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 ROOT = Path(__file__).resolve().parents[2]
 SESSION, TABLE = ROOT / 'bags/sample_session', ROOT / 'bags/sample_session/table.yaml'
 

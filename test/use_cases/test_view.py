@@ -23,6 +23,8 @@ from imu_calibration.use_cases.view import PARAMETERS, RESIDUAL, SCHEMAS, SPECTR
 
 from worlds.hand_sessions import GRAVITY, simulate
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 ROOT = Path(__file__).resolve().parents[2]
 SESSION, TABLE = str(ROOT / 'bags/sample_session'), str(ROOT / 'bags/sample_session/table.yaml')
 
