@@ -234,7 +234,8 @@ class Catalogue:
         """
         if not isinstance(definitions, dict) or len(definitions) > MOST_ADDED:
             raise InputError(f'effects must be given as at most {MOST_ADDED} of NAME: {{sensor, column, unit, tolerance, text}}, got '
-                             f'{len(definitions) if isinstance(definitions, dict) else shortened(str(definitions))}; correct it')
+                             f'{len(definitions) if isinstance(definitions, dict) else shortened(str(definitions))}; correct it',
+                             code='effects_count')
         return self.with_effects(*(from_definition(name, definition) for name, definition in definitions.items()))
 
     def with_document(self, document: dict[str, Any]) -> 'Catalogue':
@@ -250,7 +251,8 @@ class Catalogue:
         strange = [] if 'format' in document else sorted(str(key) for key in document if key != 'effects')
         if strange or 'effects' not in document:
             raise InputError('a file of effects must hold effects: NAME: {sensor, column, unit, tolerance, text}, it holds '
-                             f'{", ".join(strange)[:80] or ", ".join(map(str, document))[:80] or "nothing"}; correct it')
+                             f'{", ".join(strange)[:80] or ", ".join(map(str, document))[:80] or "nothing"}; correct it',
+                             code='effects_file')
         return self.with_definitions(document['effects'] or {})
 
 

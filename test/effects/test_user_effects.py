@@ -74,22 +74,21 @@ def test_it_is_simulated_calibrated_compensated_and_checked_from_files_alone(min
     assert 'Traceback' not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('text, said', [
-    ('a: 1', 'must hold effects: NAME:'), ('effects: 3', 'must be given as at most'), ('effects: [1]', 'must be given as at most'),
-    ('effects:\n  mine: 3', "effect 'mine' must have sensor"), ('effects:\n  effects: ' + MINE[10:].split(':', 1)[0], 'must have'),
-    (MINE.replace('f_x', 'f_q'), "the unknown name 'f_q' at character 1: 'f_q * (temperature_c - 25)'"),
-    (MINE.replace('f_x', 'f_q'), "effect 'gyro_warm_force': a column must be arithmetic"),
-    (MINE.replace('- 25', '- 25 ** 0.5'), 'a power that is not an integer up to 9 at character 30'),
-    (MINE.replace('- 25)', '- 25'), "this cannot be read at character 7"),
-    (MINE.replace('gyro_warm_force', 'gyro_quadratic'), 'must have a name of its own'),
-    (MINE.replace('gyro_warm_force', 'effects'), 'must have a name of its own'),
-    (MINE + 'other: 1', 'it holds other'), (MINE.replace('tolerance', 'tolerence'), 'tolerence'),
-    ('effects:\n' + ''.join(f'  e{k}: {{}}\n' for k in range(60)), 'at most 50')])
-def test_a_file_is_refused_in_one_line_that_names_it(tmp_path, text, said):
+@pytest.mark.parametrize('text, code, values', [
+    ('a: 1', 'effects_file', ['a']), ('effects: 3', 'effects_count', [3]), ('effects: [1]', 'effects_count', ['[1]']),
+    ('effects:\n  mine: 3', 'definition_keys', ["'mine'", 3]),
+    ('effects:\n  effects: ' + MINE[10:].split(':', 1)[0], 'definition_keys', ["'effects'"]),
+    (MINE.replace('f_x', 'f_q'), 'not_arithmetic', ["'gyro_warm_force'", "'f_q'", ' 1: ', "'f_q * (temperature_c - 25)'"]),
+    (MINE.replace('- 25', '- 25 ** 0.5'), 'not_arithmetic', [' 9 ', ' 30: ']), (MINE.replace('- 25)', '- 25'), 'not_arithmetic', [' 7: ']),
+    (MINE.replace('gyro_warm_force', 'gyro_quadratic'), 'effect_name', ["'gyro_quadratic'"]),
+    (MINE.replace('gyro_warm_force', 'effects'), 'effect_name', ["'effects'"]),
+    (MINE + 'other: 1', 'effects_file', ['other']), (MINE.replace('tolerance', 'tolerence'), 'definition_keys', ['tolerence']),
+    ('effects:\n' + ''.join(f'  e{k}: {{}}\n' for k in range(60)), 'effects_count', [50, 60])])
+def test_a_file_is_refused_in_one_line_that_names_it(tmp_path, text, code, values):
     (tmp_path / 'wrong.yaml').write_text(text)
-    with pytest.raises(InputError) as caught:
+    with refused(InputError, code, 'wrong.yaml', *values) as caught:
         files.read_effects(tmp_path / 'wrong.yaml')
-    assert said in str(caught.value) and 'wrong.yaml' in str(caught.value) and '\n' not in str(caught.value)
+    assert '\n' not in str(caught.value)
 
 
 @pytest.mark.parametrize('text, shown', [('A remark without its stop', 'A remark without its stop.'), ('Said in full.', 'Said in full.'),
