@@ -59,7 +59,7 @@ def responding():
 @pytest.mark.long
 @pytest.mark.parametrize('name', ['accel_bias_drift', 'accel_quadratic', 'gyro_bias_drift', 'gyro_g_sensitivity'])
 def test_a_hidden_effect_is_found_and_its_gain_measured(name, responding):
-    found = (responding if name == 'gyro_g_sensitivity' else diagnosed(31, HIDDEN[name])).diagnosis
+    found = (responding if name == 'gyro_g_sensitivity' else diagnosed(31, HIDDEN[name], n_poses=36)).diagnosis
     assert found.findings, [(c.effect, c.gain_alone, c.p_value_alone, c.verdict) for c in found.candidates[:4]]
     first = found.findings[0]
     assert name in (first.effect, *first.indistinguishable_from)
