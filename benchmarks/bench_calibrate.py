@@ -1,8 +1,8 @@
 """
-What the whole ``imu_calibration calibrate`` of a long bag costs, beside rosbags merely iterating over its raw messages.
+Time and memory of ``imu_calibration calibrate`` on a long bag, relative to the iteration of rosbags over its raw messages.
 
 Every repetition times both on the same bag one after the other, so that a busy machine slows both; the ratio is the median over the
-repetitions. The command is run as a user runs it, imports included. Run it alone with
+repetitions. The time of the command includes its imports. Run it separately with
 ``python benchmarks/bench_calibrate.py [--minutes M] [--repetitions N]``.
 """
 
@@ -29,7 +29,7 @@ MINUTES = 60.0
 LIMITS = {'mcap': 2.0, 'sqlite3': 4.0}
 """Storage -> largest ratio to bare iteration."""
 GROWTH, GROWTH_LIMIT = 4.0, 4.4
-"""Factor of the length, and the largest factor of the time that goes with it."""
+"""Factor of the length, and the largest permitted factor of the time."""
 MEMORY_LIMIT_MB = 500.0
 
 
@@ -47,15 +47,15 @@ class Row(NamedTuple):
     """One line of the benchmark."""
 
     name: str
-    """What was measured."""
+    """Measured quantity."""
     value: float
     """The figure, median over the repetitions."""
     unit: str
     """Its unit."""
     limit: float
-    """What it may be at most."""
+    """Largest permitted value."""
     note: str
-    """The times behind it."""
+    """Individual times."""
 
 
 def bench_calibrate(minutes=MINUTES, repetitions=REPETITIONS):
@@ -82,7 +82,7 @@ def _measure(long_bag, short_bag, storage, limit, repetitions, output):
 
 
 def iterate(bag):
-    """Return the seconds that rosbags takes for all raw messages of a bag."""
+    """Return the time of rosbags for all raw messages of a bag, s."""
     start = time.perf_counter()
     with AnyReader([bag]) as reader:
         for _ in reader.messages():

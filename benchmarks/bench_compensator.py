@@ -1,8 +1,8 @@
 """
-What the compensator costs against a plain rclpy relay: both between a serialized source and sink, in turns, in one go.
+CPU time and latency of the compensator relative to an rclpy relay, both between a serialized source and sink, alternately in one run.
 
-CPU time is that of the whole process with its DDS threads, while messages are sent. Latency is from the source's publish to the sink's
-take; added latency is what is left after that of a direct way from source to sink. Run it alone with
+CPU time includes all DDS threads of the process while messages are sent. Latency is the time from publication by the source to reception
+by the sink; added latency is the latency minus that of a direct connection from source to sink. Run it separately with
 ``python benchmarks/bench_compensator.py [--seconds S]``.
 """
 
@@ -31,10 +31,10 @@ from imu_calibration.simulation.session import random_values  # noqa: E402
 
 ENDS = str(ROOT / 'benchmarks' / 'relay_ends.py')
 TURN = 5.0
-"""Seconds that each has its turn."""
+"""Duration of one measurement of each node, s."""
 RATES = (2000, 3000, 4000, 5000, 6000, 7000, 8000, 10000)
 TARGETS = {'CPU time per message': 0.4, 'median added latency': 0.5}
-MEANING = {'plain relay': 'rclpy node that publishes each message again', 'compensator': 'bias, matrix and nine lever arms'}
+MEANING = {'plain relay': 'rclpy node that republishes each message', 'compensator': 'bias, matrix and nine lever arms'}
 
 
 def bench_calibration():
@@ -47,7 +47,7 @@ def bench_calibration():
 
 
 class Process:
-    """A node under test, on topics of its own."""
+    """A node under test, on separate topics."""
 
     def __init__(self, name, command, environment):
         self.name, self.topics = name, tuple(f'/bench_{name.replace(" ", "_")}/{end}' for end in ('raw', 'corrected'))
@@ -68,7 +68,7 @@ class Process:
 
 
 def run_once(raw, corrected, rate, seconds, environment, cpu_seconds=lambda: 0.0):
-    """Send messages to `raw` and take them from `corrected`; return (source's report, sink's report, CPU seconds used meanwhile)."""
+    """Send messages to `raw` and receive them from `corrected`; return (report of the source, report of the sink, CPU seconds)."""
     sink = subprocess.Popen([sys.executable, ENDS, 'sink', corrected], env=environment, stdout=subprocess.PIPE, text=True)
     source = _source(raw, rate, seconds, environment) if raw == corrected else None
     sink.stdout.readline()
@@ -87,7 +87,7 @@ def _source(topic, rate, seconds, environment):
 
 
 def compare(nodes, seconds, environment, rate=1000.0):
-    """Give each node turns of `TURN` at `rate`, and the direct way between them; return the direct median latency, microseconds."""
+    """Measure each node and the direct connection alternately for `TURN` s at `rate`; return the direct median latency, microseconds."""
     direct = []
     for _ in range(max(1, round(seconds / TURN))):
         for node in nodes:
@@ -102,7 +102,7 @@ def compare(nodes, seconds, environment, rate=1000.0):
 
 
 def highest_rate(node, environment, seconds):
-    """Return [(rate asked for, rate sent, messages lost)] with rising rates until messages are lost."""
+    """Return [(requested rate, actual rate, lost messages)] with rising rates until messages are lost."""
     rows = []
     for rate in RATES:
         sent, came, _ = run_once(*node.topics, rate, seconds, environment)
@@ -142,10 +142,10 @@ def _figures(node, direct):
 def main():
     """Print the figures; exit code 1 when a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--seconds', type=float, default=30.0, help='how long each node is measured at 1 kHz, default 30')
+    parser.add_argument('--seconds', type=float, default=30.0, help='duration of the measurement of each node at 1 kHz, default 30')
     options = parser.parse_args()
     figures, ratios = bench_compensator(options.seconds)
-    print(f'at 1 kHz, reliable, depth 1000; direct way from source to sink {figures["direct"]:.0f} us')
+    print(f'at 1 kHz, reliable, depth 1000; direct connection from source to sink {figures["direct"]:.0f} us')
     for name, text in MEANING.items():
         shown = ', '.join(f'{key} {figures[name][key]:.0f} us' for key in ratios)
         print(f'{name:12s} ({text}): {shown}, {figures[name]["lost"]} lost')
@@ -158,7 +158,7 @@ def main():
         rows = figures[name]['rates']
         held = [sent for _, sent, lost in rows if not lost]
         print(f'{name}: ' + (f'{max(held):.0f} Hz without loss' if held else 'loss at every rate') +
-              (f', {rows[-1][2]} lost at {rows[-1][1]:.0f} Hz' if rows[-1][2] else ' (the most the source sent)'))
+              (f', {rows[-1][2]} lost at {rows[-1][1]:.0f} Hz' if rows[-1][2] else ' (largest rate of the source)'))
         missed |= name == 'compensator' and not any(asked >= 6000 and not lost for asked, _, lost in rows)
     return 1 if missed else 0
 

@@ -1,8 +1,8 @@
 """
-How much faster Imu messages become arrays than by rosbags, one message at a time.
+Speed of the conversion of Imu messages to arrays relative to rosbags, which converts one message at a time.
 
 Every repetition times rosbags and this package on the same bag one after the other, so that a busy machine slows both; the
-ratio is the median over the repetitions. Run it alone with ``python benchmarks/bench_decode.py [--minutes M]``.
+ratio is the median over the repetitions. Run it separately with ``python benchmarks/bench_decode.py [--minutes M]``.
 """
 
 import argparse
@@ -28,7 +28,7 @@ class Row(NamedTuple):
     """One line of the benchmark."""
 
     name: str
-    """What was compared."""
+    """Compared task."""
     ours: float
     """Messages per second, median."""
     theirs: float
@@ -36,11 +36,11 @@ class Row(NamedTuple):
     ratio: float
     """Median of the ratios of one repetition."""
     target: float
-    """What must be reached; 0 for none."""
+    """Least permitted ratio; 0 for none."""
 
 
 def bench_decode(minutes=3.0, repetitions=REPETITIONS):
-    """Return the rows: decoding of Imu per storage, and of everything against rosbags' bare iteration."""
+    """Return the rows: decoding of Imu per storage, and of all messages against the bare iteration of rosbags."""
     with TemporaryDirectory() as folder:
         session = long_session(minutes)
         bags = {'sqlite3': ('sqlite3', True), 'mcap': ('mcap', True), 'mcap, Imu only': ('mcap', False)}

@@ -2,7 +2,7 @@
 Figures of the planner over random tables, tolerances and grades: ``python benchmarks/bench_plan.py [--tables N] [--seeds N]``.
 
 Each table has three axes in random directions, none closer than 60 degrees to parallel with its neighbour, 200 to 400 deg/s (the fixed profile spins at 200), and a random
-mount. Tolerances are drawn for each effect between once and three times what the fixed profile `calibration` comes to on that table, for
+mount. Tolerances are drawn for each effect between one and three times the sd of the fixed profile `calibration` on that table, for
 biases between twice and four times, so that the profile has no time to spare on some effect; it is charged with the time after which its
 own motions, in its own order, meet the tolerances. Achieved: errors of calibrations of simulated sessions over predicted sd, root mean square
 over all parameters and seeds.
@@ -49,7 +49,7 @@ from worlds.stands import STANDS, quarter_tolerances, stand  # noqa: E402
 
 RATE = 100.0
 MARKS = np.linspace(0.1, 1.0, 19)
-"""Shares of the fixed profile at which it is looked at."""
+"""Shares of the fixed profile at which its result is evaluated."""
 
 
 def fixed_profile(situation, table):

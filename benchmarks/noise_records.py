@@ -1,10 +1,10 @@
 """
-How honest and how sharp identified noise is: simulated records of four grades and three lengths, intervals and errors against the bound.
+Coverage and efficiency of identified noise: simulated records of four grades and three lengths, intervals and errors against the bound.
 
     make noise-coverage       # fresh seeds; writes the tables of docs/noise.md
 
-Every axis draws its own densities and one of four forms of slow noise. Intervals are those of the whole identification, choice of form included. Errors
-are those of the fit of the true form, against the Cramer-Rao bound of an estimator that knows the form: exact Fisher information of block means, and of the
+Every axis draws its own densities and one of four forms of slow noise. Intervals include the choice of the form. Errors
+are from the fit of the true form, relative to the Cramer-Rao bound for a given form: exact Fisher information of block means, and of the
 spectrum within blocks.
 """
 
@@ -40,7 +40,7 @@ BLOCKS = 500
 BEGIN, END = '<!-- records: begin -->', '<!-- records: end -->'
 """Marks around the tables in the document."""
 INFORMED = 0.3
-"""Errors are compared with the bound where the bound is below this share of the coefficient: elsewhere there is nothing to be sharp about."""
+"""Errors are compared with the bound where the bound is below this share of the coefficient; elsewhere the record does not determine it."""
 
 
 def record_axes(length, grade, number, seed):
@@ -67,7 +67,7 @@ def scales_of(n, period):
 
 
 def judged(truth, moments):
-    """Return what became of one axis: (name, truth, lower, upper, status) of every figure, and the errors of the fit of the true form."""
+    """Return the result of one axis: (name, truth, lower, upper, status) of every figure, and the errors of the fit of the true form."""
     found = identify_axis(moments)
     figures = []
     for name, value in truth.figures.items():
@@ -111,7 +111,7 @@ def bound(moments, truth, names):
 
 
 def moment_bound(moments, truth, names):
-    """Return the relative bounds of an estimator that knows the Allan variances only and weighs them best (GMWM's bound)."""
+    """Return the relative bounds of the optimally weighted estimator from Allan variances (GMWM's bound)."""
     design = np.column_stack(_derivatives(truth, names, moments.scales.expectation))
     processes = tuple(gauss_markov(truth.figures[TIME]) if name == 'gauss_markov' else PROCESSES[name] for name in names)
     squares = np.array([truth.figures[name]**2 for name in names])
@@ -121,7 +121,7 @@ def moment_bound(moments, truth, names):
 
 
 def _derivatives(truth, names, of):
-    """Return what each process contributes, and the change with the logarithm of the correlation time."""
+    """Return the contribution of each process, and the change with the logarithm of the correlation time."""
     parts = []
     for name in names:
         process = gauss_markov(truth.figures[TIME]) if name == 'gauss_markov' else PROCESSES[name]
@@ -133,7 +133,7 @@ def _derivatives(truth, names, of):
 
 
 def _spectrum(process, frequency, period):
-    """Return the two-sided density of a process of unit coefficient, far above the corner of slow ones."""
+    """Return the two-sided density of a process of unit coefficient, well above the corner frequency of slow processes."""
     angular = 2 * np.pi * frequency
     return {'white_noise': np.ones_like(frequency), 'quantisation': (2 * np.sin(np.pi * frequency * period) / period)**2,
             'random_walk': angular**-2, 'bias_instability': 1 / angular,
@@ -141,7 +141,7 @@ def _spectrum(process, frequency, period):
 
 
 def run(records, seed, progress=print):
-    """Return what became of all axes: length -> list of `judged`; `records` for each grade and length."""
+    """Return the results of all axes: length -> list of `judged`; `records` for each grade and length."""
     found = {}
     for label, length in LENGTHS.items():
         start = time.monotonic()
@@ -152,7 +152,7 @@ def run(records, seed, progress=print):
 
 
 def coverage(axes):
-    """Return {name: (number, share of intervals that hold the truth, share below, share above)} of figures that were asked for."""
+    """Return {name: (number, share of intervals that hold the truth, share below, share above)} of the figures in `NAMES`."""
     table = {}
     for name in NAMES:
         rows = [(value, lower, upper) for axis in axes for known, value, lower, upper, _ in axis['figures'] if known == name and lower is not None]
@@ -163,7 +163,7 @@ def coverage(axes):
 
 
 def sharpness(axes):
-    """Return {name: (number, rms error over the Cramer-Rao bound, over that of the moments)} where there is something to know."""
+    """Return {name: (number, rms error over the Cramer-Rao bound, over that of the moments)} where the bound is below `INFORMED`."""
     table = {}
     for name in NAMES:
         rows = [numbers for axis in axes for known, *numbers in axis['errors'] if known == name and numbers[1] < INFORMED]
@@ -209,10 +209,10 @@ def write(text, page=ROOT / 'docs/noise.md'):
 
 
 def main():
-    """Run, print and, when asked, write the documents."""
+    """Run, print and, on request, write the documents."""
     parser = argparse.ArgumentParser(description='Intervals and errors of identified noise over simulated records.')
     parser.add_argument('--records', type=int, default=17, help='records for each grade and length, default 17: 204 in all')
-    parser.add_argument('--seed', type=int, default=int(time.time()), help='default the time: seeds that nobody has looked at')
+    parser.add_argument('--seed', type=int, default=int(time.time()), help='default the time: unused seeds')
     parser.add_argument('--write', action='store_true', help='write the tables into docs/noise.md')
     options = parser.parse_args()
     found = run(options.records, options.seed, lambda line: print(line, flush=True))

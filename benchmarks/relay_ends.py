@@ -1,4 +1,4 @@
-"""Parts of a relay benchmark, each a process of its own: a source and a sink of serialized messages, and the plain relay to compare with."""
+"""Processes of the relay benchmark: a source and a sink of serialized messages, and the rclpy relay for comparison."""
 
 import json
 import struct
@@ -26,14 +26,14 @@ END = 2.0**40
 
 
 def template():
-    """Return one serialized message with a lively motion, and the place of the number that marks each message."""
+    """Return one serialized message of an IMU in motion, and the offset of the number that identifies each message."""
     imu = ImuSamples(np.zeros(1, np.int64), np.array([[0.3, -0.2, 9.8]]), np.array([[0.4, -0.7, 0.2]]), 'imu_link')
     data = bytearray(encode_imu(imu)[0].tobytes())
     return data, find_imu_layout(bytes(data)).offsets[ORIENTATION][0]
 
 
 def source(topic, rate, seconds):
-    """Publish with the time of sending as stamp and a running number as orientation.x; late messages are sent at once."""
+    """Publish with the send time as stamp and a running number as orientation.x; late messages are sent immediately."""
     node = rclpy.create_node('bench_source')
     publisher = node.create_publisher(Imu, topic, output_qos())
     data, number_at = template()
@@ -61,11 +61,11 @@ def source(topic, rate, seconds):
 
 
 class _Ended(Exception):
-    """The last message came."""
+    """The last message was received."""
 
 
 def sink(topic):
-    """Print how many messages came and how late; ends with the last message."""
+    """Print the number and the latencies of the received messages; ends with the last message."""
     node = rclpy.create_node('bench_sink')
     number_at = template()[1]
     late, numbers = [], []
@@ -96,7 +96,7 @@ def sink(topic):
 
 
 def plain_relay():
-    """Republish every message with what rclpy offers: the thing to compare with."""
+    """Republish every message by rclpy alone."""
     node = rclpy.create_node('plain_relay')
     publisher = node.create_publisher(Imu, 'imu/data_corrected', output_qos())
     node.create_subscription(Imu, 'imu/data_raw', publisher.publish, input_qos(reliable=True))
@@ -104,7 +104,7 @@ def plain_relay():
 
 
 def main():
-    """Play the part that the command line names."""
+    """Run the process given on the command line."""
     part, *arguments = sys.argv[1:]
     split = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
     rclpy.init(args=arguments[split:])

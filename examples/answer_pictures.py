@@ -1,4 +1,4 @@
-"""The pictures of the pages in docs/answers, drawn from the files that their commands left in the current folder."""
+"""Figures of the pages in docs/answers, drawn from the files that their commands wrote into the current folder."""
 
 from pathlib import Path
 
@@ -44,7 +44,7 @@ def bars_of_loss(path, names, last=()):
     for axis, sensor in zip(axes, SENSORS):
         values = [next(iter(found.values())).raw[sensor], *(loss.left[sensor] for loss in found.values()), *(0.0 for _ in last)]
         axis.barh(['raw readings', *found, *last], values, color=[RAW, *[LEFT] * len(found), *[GOOD] * len(last)])
-        axis.set(xlabel=f'{sensor}, error left, {UNIT[sensor]} rms')
+        axis.set(xlabel=f'{sensor}, residual error, {UNIT[sensor]} rms')
         axis.invert_yaxis()
     save(drawn, path)
 
@@ -58,8 +58,8 @@ def missing_angles(path):
     drawn, axis = figure()
     force = readings('faces').force_s[::20]
     unit = force / np.linalg.norm(force, axis=1)[:, None]
-    axis.plot(np.degrees(np.arctan2(unit[:, 1], unit[:, 0])), np.degrees(np.arcsin(unit[:, 2])), '.', color=GOOD, label='has been up')
-    axis.plot([135.0], [0.0], 'o', ms=12, mfc='none', mec=LEFT, label='asked for: -x +y')
+    axis.plot(np.degrees(np.arctan2(unit[:, 1], unit[:, 0])), np.degrees(np.arcsin(unit[:, 2])), '.', color=GOOD, label='recorded attitudes')
+    axis.plot([135.0], [0.0], 'o', ms=12, mfc='none', mec=LEFT, label='requested: -x +y')
     axis.set(xlabel='direction that was up: from x to y, deg', ylabel='towards z, deg', xlim=(-185, 185), ylim=(-95, 95))
     axis.legend(loc='upper left', fontsize=8)
     save(drawn, path)
@@ -106,8 +106,8 @@ def when_to_store(path):
     drawn, axis = figure()
     known, warm = files.read_calibration('warm_result/calibration.yaml'), temperatures('warm', Topics())
     axis.plot((warm.stamp_ns - warm.stamp_ns[0]) * 1e-9, warm.temperature_c, color=LEFT, label='temperature during the recording')
-    axis.axhspan(*known.conditions['temperature_range_c'], color=GOOD, alpha=0.2, label='range in which the calibration holds')
-    axis.axhline(known.model.temperature_ref_c, ls='--', color=GOOD, label='where its biases count')
+    axis.axhspan(*known.conditions['temperature_range_c'], color=GOOD, alpha=0.2, label='temperature range of the calibration')
+    axis.axhline(known.model.temperature_ref_c, ls='--', color=GOOD, label='reference temperature of the biases')
     axis.set(xlabel='s', ylabel='°C', ylim=(20, 40))
     axis.legend(fontsize=8)
     save(drawn, path)
@@ -162,4 +162,4 @@ def imu_calib(path):
 PICTURES = {'1-after-calibration': after_calibration, '2-missing-angles': missing_angles, '3-covariances': covariances, '4-warming-up': warming_up,
             '5-when-to-store': when_to_store, '6-without-a-camera': without_a_camera, '7-only-about-z': only_about_z,
             '8-continuous-or-discrete': continuous_or_discrete, '9-noise': noise_curve, '9b-imu-calib': imu_calib}
-"""Name of the page -> what draws its picture into a file."""
+"""Page -> function that draws its figure into a file."""

@@ -1,8 +1,8 @@
 """
-The pages in docs/answers: each command in them is run and its output put behind it (``make answers``).
+The pages in docs/answers: run each of their commands and write its output below it (``make answers``).
 
-A page is its own source. Blocks that begin with ``console`` hold lines ``$ command``; what follows a command is replaced by what it
-prints. The pages are worked through in alphabetical order in one folder, so that later ones find the files of earlier ones.
+A page is its own source. Blocks that begin with ``console`` contain lines ``$ command``; the lines below a command are replaced by its
+output. The pages are processed in alphabetical order in one folder, so that later pages use the files of earlier pages.
 """
 
 import argparse
@@ -21,11 +21,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / 'docs/answers'
 BLOCK = re.compile(r'^```console\n(.*?)^```$', flags=re.M | re.S)
 FILTERS = ('grep', 'head', 'tail', 'cat', 'printf')
-"""Programs beside `imu_calibration` that commands may name."""
+"""Permitted programs in addition to `imu_calibration`."""
 
 
 def run(command: str) -> str:
-    """Return what a command prints on both outputs, in the current folder; stages are joined by ``|``, and ``>`` writes a file."""
+    """Run a command in the current folder and return both of its outputs; ``|`` joins stages, ``>`` writes a file."""
     command, _, target = command.partition(' > ')
     output = ''
     for stage in command.split(' | '):
@@ -50,7 +50,7 @@ def commands(text: str) -> list[str]:
 
 
 def worked_through(text: str) -> str:
-    """Return a page with what its commands print in the current folder."""
+    """Return a page with the output of its commands in the current folder."""
     def block(match):
         parts = []
         for command in (line for line in match.group(1).splitlines() if line.startswith('$ ')):
@@ -61,13 +61,13 @@ def worked_through(text: str) -> str:
 
 
 def pages() -> list[Path]:
-    """Return the pages in the order in which they are worked through."""
+    """Return the pages in the order of processing."""
     return sorted(PAGES.glob('[0-9]*.md'))
 
 
 @contextlib.contextmanager
 def inside(folder: Path):
-    """Work in a folder that has the sample session as `session` beside it."""
+    """Change to a folder with the sample session as `session`."""
     before = Path.cwd()
     (folder / 'session').symlink_to(ROOT / 'bags/sample_session')
     os.chdir(folder)

@@ -1,4 +1,4 @@
-"""Draws docs/coverage.png: what imu/coverage shows of a calibration by hand at its beginning, on the way and at its end, from the markers that are published."""
+"""Draw docs/coverage.png: the markers of imu/coverage at the beginning, in the middle and at the end of a calibration by hand."""
 
 import textwrap
 from pathlib import Path
@@ -22,7 +22,7 @@ MINIMUM = 8.0
 
 
 def states():
-    """Yield a Coverage at the beginning, after six poses and at the end of a session that does what the picture says."""
+    """Yield a Coverage at the beginning, after six poses and at the end of a session that follows the recommended motions."""
     up = np.array([0.0, 0.0, 1.0])
     knowledge, seen = knowledge_of(NOTHING, None, HandOptions(gravity=9.81)).then(HandStep(up)), [up]
     yield shown(knowledge, seen)
@@ -36,7 +36,7 @@ def states():
 
 
 def shown(knowledge, seen):
-    """Return the Coverage of what is known, as calibration_node makes it."""
+    """Return the Coverage as published by calibration_node."""
     steps = foretold(knowledge)
     first, seconds = steps[0], sum(step.seconds for step in steps)
     return Coverage(knowledge.best()[1], np.array(seen), seen[-1], Step(first.words, first.up, first.axis, first.angle), seconds)

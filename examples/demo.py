@@ -1,5 +1,5 @@
 """
-The main job in one run: simulate, calibrate, compensate another session, compare.
+The main tasks in one run: simulate, calibrate, compensate another session, compare with the truth.
 
 Run: ``python examples/demo.py --output demo`` (or ``make demo``).
 """
@@ -18,7 +18,7 @@ from imu_calibration.use_cases.recordings import source_of
 
 
 def verb(*arguments):
-    """Run one verb as a user would, and show the command."""
+    """Run one verb through the command line and print the command."""
     print('\n$ imu_calibration ' + ' '.join(str(a) for a in arguments))
     code = main([str(a) for a in arguments])
     if code == 1:
@@ -37,7 +37,7 @@ def run(folder):
     truth = stream.session_truth(source_of(second, joint_names=table.joint_names)(), table)
     show(stream.before_and_after(truth, calibration))
     lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
-    print('not determined by this recording: ' + (', '.join(lacking) if lacking else 'nothing; every parameter is within its tolerance'))
+    print('not determined by this recording: ' + (', '.join(lacking) if lacking else 'none; every parameter is within its tolerance'))
     print(f'report: {(folder / "report.html").resolve()}')
 
 
@@ -55,13 +55,13 @@ def show(figures):
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--output', default='demo', help='folder for everything, made anew')
+    parser.add_argument('--output', default='demo', help='output folder; an earlier demonstration in it is replaced')
     target = Path(parser.parse_args().output)
     if target.exists():
         known = {'session', 'other_session', 'other_session_corrected', 'calibration.yaml', 'report.html'}
         strangers = sorted(p.name for p in target.iterdir() if p.name not in known)
         if strangers:
-            raise SystemExit(f'{target} must be empty or hold an earlier demonstration, it holds {strangers[0]}; choose another --output')
+            raise SystemExit(f'{target} must be empty or contain an earlier demonstration, it contains {strangers[0]}; choose another --output')
         shutil.rmtree(target)
     target.mkdir(parents=True)
     run(target)

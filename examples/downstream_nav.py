@@ -1,10 +1,10 @@
 """
-What calibration is worth downstream: a small navigation node, fed once with /imu/data_raw and once with /imu/data, over DDS from a bag.
+Effect of a calibration on navigation: dead reckoning from /imu/data_raw and from /imu/data, over DDS from a bag.
 
-The node integrates the rate and the specific force and sets its velocity to zero whenever the robot stands (zero-velocity update); it publishes
-nav_msgs/Odometry. Everything else is as on a robot: bag_player_node plays a drive, compensator_node corrects it with a calibration.
+The node integrates the rate and the specific force and sets its velocity to zero at rest (zero-velocity update); it publishes nav_msgs/Odometry.
+The remaining nodes are those of a robot: bag_player_node plays a drive, compensator_node corrects it with a calibration.
 
-Run: ``python examples/downstream_nav.py [--picture FILE]``; takes about half a minute.
+Run: ``python examples/downstream_nav.py [--picture FILE]``; it needs about half a minute.
 """
 
 import argparse
@@ -38,16 +38,16 @@ GRAVITY, RATE, SECONDS, LEG, STOP = 9.81, 100.0, 120.0, 20.0, 4.0
 FACTOR = 5.0
 """Simulated seconds per second."""
 DEPTH = 20_000
-"""Messages that may wait: more than the drive has, so that a busy machine loses none."""
+"""Queue length: larger than the number of messages of the drive, so that a busy machine loses none."""
 MOST_LOST = 250
-"""Of 12000; until the robot is levelled, a second after the start, there is no place yet."""
+"""Of 12000; before levelling, one second after the start, no position is published."""
 NOISE = {'accelerometer': 0.01, 'gyroscope': 0.001}
 TOPICS = {'imu/data_raw': 'odom_raw', 'imu/data': 'odom'}
 PATIENCE = 120.0
 
 
 def drive(seed):
-    """Return (time, true rate, true force, path) of a robot that drives curves on a floor and stands before each leg."""
+    """Return (time, true rate, true force, path) of a robot that drives curves on a floor and stops before each leg."""
     rng, time_ = np.random.default_rng(seed), np.arange(0, SECONDS, 1 / RATE)
     phase, leg = time_ % LEG, (time_ // LEG).astype(int)
     moving = np.clip(np.minimum(phase - STOP, LEG - phase), 0, 1)   # each leg begins at rest
@@ -56,12 +56,12 @@ def drive(seed):
     heading = np.cumsum(turn) / RATE
     path = np.cumsum(speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0) / RATE
     force = np.stack([np.gradient(speed, 1 / RATE), speed * turn, np.full(len(time_), GRAVITY)], axis=1)
-    floor = moving[:, None] * rng.normal(0, 0.8, (len(time_), 3))   # what tells a slow drive from a stand
+    floor = moving[:, None] * rng.normal(0, 0.8, (len(time_), 3))   # vibration that distinguishes a slow drive from rest
     return time_, np.stack([0 * turn, 0 * turn, turn], axis=1), force + floor, path
 
 
 def measured(time_, rate, force, seed):
-    """Return ImuSamples of the IMU whose errors bags/sample_session/truth.yaml holds."""
+    """Return ImuSamples of the IMU with the errors of bags/sample_session/truth.yaml."""
     truth, rng = files.read_calibration(SESSION / 'truth.yaml'), np.random.default_rng(seed)
     alpha = np.gradient(rate, 1 / RATE, axis=0)
     temperature = np.full(len(time_), truth.model.temperature_ref_c)
@@ -73,15 +73,15 @@ def measured(time_, rate, force, seed):
 
 
 class DeadReckoning:
-    """Attitude, velocity and place from specific force and rate; levelled at the first stop, at rest at every one."""
+    """Attitude, velocity and position from specific force and rate; levelled at the first stop, velocity zero at every stop."""
 
     def __init__(self):
         self._stops = StopDetector(np.repeat(list(NOISE.values()), 3))
         self._first = self._before = None
-        self.attitude, self.velocity, self.place = None, np.zeros(3), np.zeros(3)
+        self.attitude, self.velocity, self.position = None, np.zeros(3), np.zeros(3)
 
     def step(self, stamp_ns, rate, force):
-        """Take a sample; return whether there is a place yet."""
+        """Process a sample; return whether the position is available."""
         self._first = stamp_ns if self._first is None else self._first
         now = (stamp_ns - self._first) * 1e-9
         stop = self._stops.push(np.array([[now, *force, *rate]]))
@@ -95,7 +95,7 @@ class DeadReckoning:
             self.velocity = self.velocity + (self.attitude.apply(force) - [0, 0, GRAVITY]) * seconds
             if stop is not None:
                 self.velocity = np.zeros(3)
-            self.place = self.place + self.velocity * seconds
+            self.position = self.position + self.velocity * seconds
         self._before = now
         return self.attitude is not None
 
@@ -125,14 +125,14 @@ class Navigator:
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
         message.header.frame_id, message.child_frame_id = 'odom', 'imu_link'
         pose = message.pose.pose
-        pose.position.x, pose.position.y, pose.position.z = found.place.tolist()
+        pose.position.x, pose.position.y, pose.position.z = found.position.tolist()
         pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = found.attitude.as_quat().tolist()
         self.publisher.publish(message)
-        self.path.append((stamp_ns, *found.place))
+        self.path.append((stamp_ns, *found.position))
 
 
 def navigate(bag, calibration, domain_id):
-    """Play the bag through a compensator and two navigators; return {topic: path, rows of stamp and place}."""
+    """Play the bag through a compensator and two navigators; return {topic: path, rows of stamp and position}."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     os.environ |= {'ROS_DOMAIN_ID': str(domain_id), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
@@ -147,12 +147,12 @@ def navigate(bag, calibration, domain_id):
             end = time.monotonic() + PATIENCE
             while not corrected.node.count_publishers(corrected.input.topic_name):
                 if time.monotonic() > end:
-                    raise SystemExit('the compensator did not begin in time; is the machine very busy?')
-                executor.spin_once(timeout_sec=0.1)   # who hears of the first rest late begins at the second
+                    raise SystemExit('the compensator did not start within the time limit; run it again on an idle machine')
+                executor.spin_once(timeout_sec=0.1)   # a subscriber that misses the first rest is levelled at the second
             player = processes.start('bag_player_node', {'bag': bag, 'rate': FACTOR, 'wait_for_subscribers': 2})
             while player.poll() is None or time.monotonic() - max(navigator.last for navigator in navigators) < 2.0:
                 if time.monotonic() > end:
-                    raise SystemExit('the drive did not come to an end in time; is the machine very busy?')
+                    raise SystemExit('the drive did not end within the time limit; run it again on an idle machine')
                 executor.spin_once(timeout_sec=0.1)
             return {name: np.array(navigator.path, dtype=object) for name, navigator in zip(TOPICS, navigators, strict=True)}
         finally:
@@ -160,13 +160,13 @@ def navigate(bag, calibration, domain_id):
 
 
 def errors_of(paths, stamps, path):
-    """Return {topic: (largest error, error at the end, m; path in the plane)}, turned to the true heading at the start, as the true path is."""
+    """Return {topic: (largest error, error at the end, m; path in the plane)}, with the true heading at the start."""
     found = {}
     for topic, rows in paths.items():
         index = np.searchsorted(stamps, rows[:, 0].astype(np.int64))
-        places = rows[:, 1:3].astype(float)
-        off = np.linalg.norm(places - (path[index] - path[index[0]]), axis=1)
-        found[topic] = float(off.max()), float(off[-1]), places
+        positions = rows[:, 1:3].astype(float)
+        off = np.linalg.norm(positions - (path[index] - path[index[0]]), axis=1)
+        found[topic] = float(off.max()), float(off[-1]), positions
     return found
 
 
@@ -177,8 +177,8 @@ def draw(found, path, picture):
     import matplotlib.pyplot as plt
     figure, axes = plt.subplots(figsize=(8, 3.2), layout='constrained')
     axes.plot(*(path - path[0]).T, color='0.3', linewidth=3, label='true')
-    for (topic, (_, last, places)), color in zip(found.items(), ('tab:red', 'tab:blue'), strict=True):
-        axes.plot(*places.T, color=color, label=f'/{topic}: {last:.1f} m off at the end')
+    for (topic, (_, last, positions)), color in zip(found.items(), ('tab:red', 'tab:blue'), strict=True):
+        axes.plot(*positions.T, color=color, label=f'/{topic}: error {last:.1f} m at the end')
     axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal', title=f'Dead reckoning for {SECONDS:.0f} s, at rest every {LEG:.0f} s')
     axes.legend(loc='lower left', fontsize=8)
     figure.savefig(picture, dpi=90)
@@ -193,12 +193,12 @@ def run(domain_id, picture, folder):
     paths = navigate(folder / 'drive', folder / 'calibration.yaml', domain_id)
     lost = {topic: len(imu) - len(rows) for topic, rows in paths.items()}
     if max(lost.values()) > MOST_LOST:
-        raise SystemExit(f'too many messages were lost on a busy machine to compare anything: {lost}; run it again')
+        raise SystemExit(f'too many messages were lost for a comparison: {lost}; run it again on an idle machine')
     found = errors_of(paths, imu.stamp_ns, path)
     for topic, (most, last, _) in found.items():
-        print(f'/{topic}: {last:.2f} m off at the end, {most:.2f} m at most')
+        print(f'/{topic}: error {last:.2f} m at the end, largest {most:.2f} m')
     (_, raw, _), (_, corrected, _) = found.values()
-    print(f'calibrated, the robot knows where it is {raw - corrected:.2f} m better after {SECONDS:.0f} s')
+    print(f'the calibration reduces the position error after {SECONDS:.0f} s by {raw - corrected:.2f} m')
     if picture:
         draw(found, path, picture)
         print(f'written: {picture}')
@@ -208,7 +208,7 @@ def run(domain_id, picture, folder):
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--domain-id', type=int, default=1 + os.getpid() % 100, help='ROS_DOMAIN_ID, default one of its own')
-    parser.add_argument('--picture', metavar='FILE', default=str(ROOT / 'docs' / 'downstream_nav.png'), help='where to draw the paths')
+    parser.add_argument('--picture', metavar='FILE', default=str(ROOT / 'docs' / 'downstream_nav.png'), help='file of the figure')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         sys.exit(run(options.domain_id, options.picture, Path(temporary)))

@@ -1,10 +1,10 @@
 """
 The closed loop as processes over real DDS: a simulated table, calibration_node, planner_node, then compensator_node.
 
-An IMU that nobody has calibrated, with a fault that no parameter of its model describes, is turned through its six faces, as is usual. Every parameter is
-known well enough by that, but at +-1 g a parabola and a gain of its own for either sign are the same: the diagnosis names a class. The planner drives what
-tells them apart, until one name is left; the finding joins the live calibration, and the compensator corrects another motion with it. Run:
-``python examples/live_demo.py`` (or ``make live-demo``); takes less than two minutes, needs no ``ros2 launch``, and leaves ``live_demo.png``.
+An uncalibrated IMU with a fault outside its model is turned through its six faces. This motion determines every parameter of the model, but at +-1 g a
+quadratic term and an asymmetry of the scale factor are collinear, so the diagnosis reports a class of effects. The planner drives the motion that separates
+them until one effect remains. The live calibration then includes this effect, and the compensator corrects another motion with it. Run:
+``python examples/live_demo.py`` (or ``make live-demo``); it needs less than two minutes and no ``ros2 launch``, and writes ``live_demo.png``.
 """
 
 import argparse
@@ -27,7 +27,7 @@ TABLE = ROOT / 'config' / 'table_simulated.yaml'
 FACTOR = 4.0
 """Simulated seconds per second."""
 HIDDEN, PROFILE = 'soft_spring', 'six_faces'
-"""What is wrong with the IMU, by its physics; the first motion."""
+"""Physical fault of the simulated IMU; first motion."""
 SIMULATOR = {'table_file': TABLE, 'seed': 1, 'imu_seed': 5, 'imu_rate': 100.0, 'joint_rate': 100.0, 'time_factor': FACTOR, 'truth': True,
              'hide': HIDDEN, 'hide_size': 2.0}
 START = 1_800_000_000.0
@@ -35,7 +35,7 @@ PATIENCE = 240.0
 
 
 class Watcher:
-    """A node that collects what the others publish."""
+    """A node that collects the messages of the other nodes."""
 
     def __init__(self, processes):
         import rclpy
@@ -68,17 +68,17 @@ class Watcher:
         self.stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
     def spin(self, until, deadline):
-        """Spin until a condition holds; give up at the deadline."""
+        """Spin until a condition holds; raise SystemExit at the deadline."""
         while not until():
             for process in self._processes.running:
                 if process.poll():
                     raise SystemExit(f'a node ended with exit code {process.returncode}: {" ".join(process.args[1:4])}')
             if time.monotonic() > deadline:
-                raise SystemExit('the demonstration did not come to an end in time; is the machine very busy?')
+                raise SystemExit('the demonstration did not end within its time limit; run it again on an idle machine')
             self._rclpy.spin_once(self.node, timeout_sec=0.1)
 
     def call(self, service, deadline):
-        """Call a Trigger service and return its answer."""
+        """Call a Trigger service and return its response."""
         from std_srvs.srv import Trigger
         client = self.node.create_client(Trigger, service)
         self.spin(client.service_is_ready, deadline)
@@ -87,11 +87,11 @@ class Watcher:
         return future.result()
 
     def take(self, topic):
-        """Return what came on a topic since the last call (SampleBlock)."""
+        """Return the messages of a topic since the last call (SampleBlock)."""
         return self.streams[topic].flush()
 
     def close(self):
-        """Leave DDS."""
+        """Destroy the node and shut rclpy down."""
         self.node.destroy_node()
         self._rclpy.try_shutdown()
 
@@ -102,7 +102,7 @@ def once(samples):
 
 
 def differences(samples, truth):
-    """Return the time (s) and one-second means of what was measured minus the truth at the same stamps: force and rate, each shape (n, 3)."""
+    """Return time (s) and one-second means of measured minus true force and rate at the same stamps, each of shape (n, 3)."""
     _, here, there = np.intersect1d(samples.stamp_ns, truth.stamp_ns, return_indices=True)
     rate = int(SIMULATOR['imu_rate'])
     count = len(here) // rate * rate
@@ -117,7 +117,7 @@ def run(domain_id, folder, output):
     deadline = begin + PATIENCE
     os.environ |= {'ROS_DOMAIN_ID': str(domain_id), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     with NodeProcesses(domain_id) as processes:
-        print(f'ROS_DOMAIN_ID {domain_id}: starting calibration_node, simulator_node and planner_node; the IMU hides: {HIDDEN}', flush=True)
+        print(f'ROS_DOMAIN_ID {domain_id}: starting calibration_node, simulator_node and planner_node; hidden effect of the IMU: {HIDDEN}', flush=True)
         calibration_node = processes.start('calibration_node', {'table_file': TABLE, 'save_file': folder / 'live.yaml', 'diagnosis_period': 3600.0})
         planner = processes.start('planner_node', {'table_file': TABLE, 'time_limit': 300.0, 'first_speed': 0.6, 'stall_patience': 15.0, 'silence': 5.0})
         watcher = Watcher(processes)
@@ -147,12 +147,12 @@ def first_motion(watcher, deadline):
     from imu_calibration.simulation.profiles import make_profile
     seconds = make_profile(PROFILE, SIMULATOR['seed'], files.read_table(TABLE)).duration
     watcher.spin(lambda: watcher.stamp > START + seconds, deadline)
-    print(f'{PROFILE}: {seconds:.0f} s; the planner takes over', flush=True)
+    print(f'{PROFILE}: {seconds:.0f} s; the planner starts', flush=True)
 
 
 def drive(watcher, deadline):
-    """Start the planner and wait until it is done."""
-    while not watcher.call('/planner_node/start', deadline).success:   # until all have found each other
+    """Start the planner and wait until it has finished."""
+    while not watcher.call('/planner_node/start', deadline).success:   # until DDS discovery is complete
         pause = time.monotonic() + 0.5
         watcher.spin(lambda end=pause: time.monotonic() > end, deadline)
 
@@ -164,10 +164,10 @@ def drive(watcher, deadline):
 
 
 def compare(watcher, processes, deadline):
-    """Compensate another motion of the same IMU; return time and differences before and after, None when nothing came."""
+    """Compensate another motion of the same IMU; return time and differences before and after, None without corrected messages."""
     for topic in watcher.streams:
         watcher.take(topic)
-    print('another motion of the same IMU, compensated live', flush=True)
+    print('compensating another motion of the same IMU', flush=True)
     simulator = processes.start('simulator_node', {**SIMULATOR, 'profile': 'tumbling', 'seed': 4, 'start_time': START + 10_000.0, 'stop_at_end': True,
                                                    'wait_for_subscribers': 2})
     watcher.spin(lambda: simulator.poll() is not None, deadline)
@@ -185,19 +185,19 @@ def compare(watcher, processes, deadline):
 
 
 def events(drive):
-    """Yield (time, words) of what the planner learnt of causes and began because of it."""
-    told = None
+    """Yield (time, text) of the diagnosis requests, separations and findings of the planner."""
+    previous = None
     for at, text, values in drive:
-        told_apart, found = (values.get(key, '').replace(' ', ', ') for key in ('told apart', 'found'))
-        what = ('asks the diagnosis' if text.startswith('asking') else f'tells apart {told_apart}' if values.get('separating') == 'True' else
-                f'named: {found}' if values['state'] == 'done' and found else '')
-        if what and what != told:
-            yield at, what
-        told = what or told
+        candidates, found = (values.get(key, '').replace(' ', ', ') for key in ('told apart', 'found'))
+        event = ('waits for the diagnosis' if text == 'diagnosing' else f'separates {candidates}' if values.get('separating') == 'True' else
+                 f'found: {found}' if values['state'] == 'done' and found else '')
+        if event and event != previous:
+            yield at, event
+        previous = event or previous
 
 
 def picture(path, watcher, calibration, errors):
-    """Draw the whole of it: what was known when, what the planner did, and what the compensator left."""
+    """Draw standard deviations over time, the actions of the planner, and the errors before and after compensation."""
     import matplotlib
     matplotlib.use('Agg')
     import matplotlib.pyplot as plt
@@ -205,7 +205,7 @@ def picture(path, watcher, calibration, errors):
     from imu_calibration.document.calibration_text import calibration_from_text
     from imu_calibration.estimation.status import tolerances_of
     start = next(at for at, text, _ in watcher.drive if not text.startswith('idle'))
-    figure, (known, left) = plt.subplots(2, 1, figsize=(9, 7), constrained_layout=True)
+    figure, (known, errors_axes) = plt.subplots(2, 1, figsize=(9, 7), constrained_layout=True)
     usual, lines = files.read_tolerances(ROOT / 'config' / 'tolerances.yaml'), {}
     for at, text in watcher.documents:
         found = calibration_from_text(text)
@@ -216,26 +216,26 @@ def picture(path, watcher, calibration, errors):
         known.semilogy(*zip(*points, strict=True), color='tab:blue' if name.startswith('accel') else 'tab:orange', lw=0.8)
     known.axhline(1.0, color='k', lw=1)
     end = max(at for at, _, _ in watcher.drive)
-    for row, (at, words) in enumerate(events(watcher.drive)):
+    for row, (at, event) in enumerate(events(watcher.drive)):
         known.axvline(at - start, color='tab:red', lw=1)
         side = 'left' if at - start < 0.5 * (end - start) else 'right'
-        known.text(at - start, 0.93 - 0.09 * row, f' {words} ', color='tab:red', ha=side, fontsize=8, transform=known.get_xaxis_transform(), in_layout=False,
+        known.text(at - start, 0.93 - 0.09 * row, f' {event} ', color='tab:red', ha=side, fontsize=8, transform=known.get_xaxis_transform(), in_layout=False,
                    bbox={'facecolor': 'white', 'edgecolor': 'none', 'alpha': 0.8, 'pad': 0.5})
     known.set(xlabel='s since the planner started', ylabel='standard deviation / tolerance',
-              title=f'{PROFILE}, then {watcher.drive[-1][2]["motion"]} planned motions: every accelerometer (blue) and gyroscope (orange) parameter')
+              title=f'{PROFILE}, then {watcher.drive[-1][2]["motion"]} planned motions: parameters of accelerometer (blue) and gyroscope (orange)')
     found = [effect.name for effect in calibration.model.effects if effect.sensor == 'accelerometer' and effect.name not in ('bias', 'matrix')]
     for label, (seconds, force, _), color in (('as measured', errors[0], 'tab:gray'), ('compensated', errors[1], 'tab:green')):
-        left.plot(seconds, np.linalg.norm(force, axis=1) / (1e-3 * G), color=color, label=label)
-    left.set(xlabel='s of another motion', ylabel='error of the accelerometer, mg', yscale='log',
-             title=f'hidden: {HIDDEN}; in the model in the end: {", ".join(found) or "nothing"}')
-    left.legend(loc='upper right')
+        errors_axes.plot(seconds, np.linalg.norm(force, axis=1) / (1e-3 * G), color=color, label=label)
+    errors_axes.set(xlabel='s of another motion', ylabel='error of the accelerometer, mg', yscale='log',
+             title=f'hidden effect: {HIDDEN}; effects in the final model: {", ".join(found) or "none"}')
+    errors_axes.legend(loc='upper right')
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
 
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--domain-id', type=int, default=1 + os.getpid() % 100, help='ROS_DOMAIN_ID, default one of its own')
+    parser.add_argument('--domain-id', type=int, default=1 + os.getpid() % 100, help='ROS_DOMAIN_ID, default derived from the process id')
     parser.add_argument('--output', type=Path, default=Path('demo'), help='folder for the picture, default demo')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:

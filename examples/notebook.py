@@ -1,7 +1,7 @@
 # %% [markdown]
 # # An IMU on a turntable, in a notebook
 #
-# Every cell runs as it is, in Jupyter, VS Code or Spyder (percent format) and as a script: `python examples/notebook.py`.
+# Every cell runs unchanged, in Jupyter, VS Code or Spyder (percent format) and as a script: `python examples/notebook.py`.
 # Two lines calibrate a bag: the import, and `imu.calibrate('session.bag', 'table.yaml')`.
 
 # %%
@@ -18,8 +18,7 @@ found = imu.calibrate(SESSION, SESSION / 'table.yaml')
 found
 
 # %% [markdown]
-# Every parameter has a standard deviation and a status; the verdict says what to do next. What the calibration leaves in each window, beside what noise
-# alone would leave:
+# Every parameter has a standard deviation and a status; the verdict contains the next step. The residual of each window, with its expectation from noise:
 
 # %%
 found.plot('accelerometer')
@@ -28,8 +27,8 @@ found.plot('accelerometer')
 found.plot('gyroscope')
 
 # %% [markdown]
-# A calibration is an object that compensates arrays. The sample session was simulated, so that the truth is known: how far off is each parameter, in the
-# standard deviations that are reported?
+# A calibration is an object that compensates arrays. The sample session was simulated, so that the truth is available: the error of each parameter,
+# divided by its reported standard deviation:
 
 # %%
 truth = imu.load(SESSION / 'truth.yaml')
@@ -44,9 +43,9 @@ force, rate = found.calibration.compensate(np.tile([0.0, 0.0, 9.81], (4, 1)), np
 force[-1], rate[-1]
 
 # %% [markdown]
-# ## What a model gets wrong
+# ## Errors of the sensor model
 #
-# Hide a cause in a simulated session, an IMU whose gyroscopes feel gravity, and let the diagnosis find it. Samples in memory are as good as a bag.
+# The simulated session has an effect outside the model, a g-sensitivity of the gyroscopes; the diagnosis finds it. Samples in memory replace the bag.
 
 # %%
 session = imu.simulate('short', effects=['gyro_g_sensitivity'], seed=11)
@@ -60,12 +59,12 @@ diagnosis
 diagnosis.plot(2)
 
 # %% [markdown]
-# The extended calibration takes the cause out.
+# The extended calibration corrects the effect.
 
 # %%
 corrected = imu.compensate(session.samples, diagnosis.calibration)
 corrected
 
 # %% [markdown]
-# Everything that was found as files: `found.save('result')` writes calibration.yaml and report.html, `diagnosis.save('finding')` also diagnosis.json,
+# Files: `found.save('result')` writes calibration.yaml and report.html, `diagnosis.save('finding')` also diagnosis.json, and
 # `session.save('session_bag')` a bag.

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Rerun the four samples of Avrutov et al., "3D-Calibration of the IMU" (ELNANO 2017), and print what holds and what does not."""
+"""Rerun the four samples of Avrutov et al., "3D-Calibration of the IMU" (ELNANO 2017), and compare the results with the published claims."""
 
 import itertools
 
@@ -128,7 +128,7 @@ def print_section_5():
 
 
 def print_findings():
-    heading('What does not hold')
+    heading('Claims that are not reproduced')
     for k, finding in enumerate(findings(), start=1):
         print(f'{k}. {finding}')
 
@@ -143,7 +143,7 @@ def findings():
            f'{numerical_rank(avrutov.design_matrix(literal, "products"))} of 7. With gimbals the rank is full in every order.')
     conds = [condition_numbers(avrutov.design_matrix(readings(o, a), 'products'))[0] for o in avrutov.GIMBAL_ORDERS for a in 'xyz']
     yield (f'Neither order nor gravity direction is given, yet cond of the n x 7 design runs from {min(conds):.1f} to {max(conds):.1f}; '
-           'noise-free recovery cannot tell them apart.')
+           'noise-free recovery does not separate them.')
     products_sd = [max(avrutov.calibrate(readings(o, a), np.zeros((41, 3)), 'products').unit_sd[4:])
                    for o in avrutov.GIMBAL_ORDERS for a in 'xyz']
     yield (f'At 1 mV the product terms of sample 2 (nominal 1 mV/g^2) have sd up to {min(products_sd):.2f} mV/g^2 in the best order and '

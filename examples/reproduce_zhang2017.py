@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Rerun Zhang et al., "Comprehensive Calibration of Strap-Down Tri-Axis Accelerometer Unit" (Sensors 2017), and print what holds."""
+"""Rerun Zhang et al., "Comprehensive Calibration of Strap-Down Tri-Axis Accelerometer Unit" (Sensors 2017), and compare the results with the published claims."""
 
 import numpy as np
 
@@ -58,7 +58,7 @@ def simulated_readings(rng, rate_deg_s):
     """
     Return window means (measured, compensated, reference) with x up and down, from Table 1 and Table 3, 0.1 mg of noise.
 
-    They are compensated with what the paper's method estimates from other readings: six positions, and arms by eq. 24.
+    They are compensated with the estimates of the paper's method from other readings: six positions, and arms by eq. 24.
     """
     calibration, arms = six_position_calibration(rng), mean_of_rates(rng, 0.1 * MG)
     runs = [spin((sign, 0, 0), rate_deg_s, 1.0) for sign in (1, -1)]
@@ -126,7 +126,7 @@ def print_table_3(rng):
 
 
 def print_designs():
-    heading('What a design can determine: 6 faces + 9 runs, 0.1 mg per mean; arms in mm, tolerance 0.1 mm')
+    heading('Parameters that a design determines: 6 faces + 9 runs, 0.1 mg per mean; arms in mm, tolerance 0.1 mm')
     for design in DESIGNS:
         judged = judge_design(design_runs(design), SENSOR.cosines, ARMS)
         sd = 0.1 * np.array([one.sd_over_tolerance[4:] for one in judged])
@@ -173,7 +173,7 @@ def print_tumbling(rng):
 
 
 def print_findings():
-    heading('What does not hold')
+    heading('Claims that are not reproduced')
     for k, finding in enumerate(findings(), start=1):
         print(f'{k}. {finding}')
 
@@ -209,7 +209,7 @@ def findings():
     sd = 1e3 * zhang.closed_form_sd(0.75 * MG, rate, SENSOR.cosines)
     yield (f'Only r_xx, r_yy, r_zz can be seen: at 200 deg/s and the sensor\'s 0.75 mg the off-axis arms have sd '
            f'{sd[OFF_AXIS].min():.0f} to {sd[OFF_AXIS].max():.0f} mm, the printed values are {1e3 * np.abs(ARMS[OFF_AXIS]).min():.2f} to '
-           f'{1e3 * np.abs(ARMS[OFF_AXIS]).max():.2f} mm. Averaging over rates does not create what is missing; a skewed fixture '
+           f'{1e3 * np.abs(ARMS[OFF_AXIS]).max():.2f} mm. Averaging over rates adds no information; a skewed fixture '
            f'({1e3 * zhang.closed_form_sd(0.75 * MG, rate, SENSOR.cosines, spin_axes=skewed_axes(60)).max():.1f} mm) or oscillations do.')
     equilibrated = np.linalg.cond(jacobian(design_runs('Z0'), TRUTH[0]) / np.linalg.norm(jacobian(design_runs('Z0'), TRUTH[0]), axis=0))
     yield f'An equilibrated condition number does not see this ({equilibrated:.1f} for Zhang\'s design); tolerances do.'
@@ -224,7 +224,7 @@ def findings():
            f'{zhang.TABLE_2_G[2, 0] * -G * 47.4**2 / 2:.1f} m at 47.4 s.')
     left = zhang.TABLE_2_G[1, 1] * G
     yield (f'y of Table 2 after compensation ({1e3 * zhang.TABLE_2_G[1, 1]:.2f} mg) alone gives {left * 50:.2f} m/s, {left * 1250:.0f} m '
-           f'in 50 s: {left * 50 / 0.02:.0f} and {left * 1250 / 0.3:.0f} times what is claimed.')
+           f'in 50 s: {left * 50 / 0.02:.0f} and {left * 1250 / 0.3:.0f} times the claimed value.')
     tilt = np.sin(np.deg2rad(2 / 60)) * G
     yield f'Levelling to 2 arcmin alone gives {tilt * 50:.2f} m/s and {tilt * 1250:.1f} m in 50 s.'
     yield ('"15 parameters" are 3 + 9 + 3, of which 12 are independent (unit rows); the nine arms are not counted: 21. Eq. 11 lost the dot '

@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """
-Count marker words in docstrings, comments, messages and pages: words that technical English rarely needs; fail above the limit.
+Count marker words in docstrings, comments, messages and pages: words that technical English rarely needs; fail above a limit.
 
 Usage: `plain.py [ROOT] [--folders] [--worst N]`; ROOT is a folder or one file. A marker is frequent in sentences with one of four habits:
 a clause in place of a noun ("what is left" for "the residual"), data that speak ("the windows say"), a common verb in place of the
@@ -15,8 +15,8 @@ import re
 import sys
 import tokenize
 
-MOST = 36.0
-"""Markers per 1,000 words of the whole product; lower it whenever the rate has fallen, never raise it."""
+MOST = {'docstring': 6.0, 'comment': 6.0, 'message': 8.0, 'page': 10.0}
+"""Largest number of markers per 1,000 words of each kind of text; lower it when the rate has fallen, never raise it."""
 MARKERS = set("""
 what whatever whoever whose nobody nothing everything everybody somebody hardly anew strange alone else others those
 say says said tell tells told ask asks asked speak speaks spoken answer answers answered know knows let lets
@@ -57,7 +57,7 @@ def files(root):
     """Return the product's Python files and the pages."""
     if root.is_file():
         return [root]
-    skip = {'test', 'build', 'install', 'validation', 'benchmarks', 'examples', 'tools'}
+    skip = {'test', 'build', 'install', 'validation', 'tools'}
     found = [path for path in root.rglob('*.py')
              if not any(part in skip or part.startswith('.') for part in path.relative_to(root).parts)]
     found += [p for p in [root / 'README.md', root / 'CONTRIBUTING.md'] if p.exists()]
@@ -100,10 +100,10 @@ def main():
         if ('all', kind) in count:
             print(row(kind, count['all', kind]))
     print(row('total', total))
-    rate = 1000 * total[1] / max(total[0], 1)
-    if arguments.root.is_dir() and rate > MOST:
-        sys.exit(f'At most {MOST} marker words per 1,000 are allowed, {rate:.2f} were found: '
-                 'rewrite the sentences that `tools/plain.py --worst 20` prints.')
+    rates = {kind: 1000 * numbers[1] / max(numbers[0], 1) for (group, kind), numbers in count.items() if group == 'all'}
+    above = [f'{rate:.2f} in {kind}s (limit {MOST[kind]:g})' for kind, rate in rates.items() if rate > MOST[kind]]
+    if arguments.root.is_dir() and above:
+        sys.exit(f'Too many marker words per 1,000 words: {", ".join(above)}. Rewrite the sentences that `tools/plain.py --worst 20` prints.')
 
 
 if __name__ == '__main__':

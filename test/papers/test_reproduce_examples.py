@@ -45,7 +45,7 @@ def test_example_runs_and_reports(name, lines):
     output = run_example(name)
     print(output)
     assert [line for line in lines if line not in output] == []
-    findings = output.split('What does not hold')[1]
+    findings = output.split('Claims that are not reproduced')[1]
     assert findings.count('\n') >= 12
 
 
