@@ -10,7 +10,7 @@ from imu_calibration.calibration.by_evidence import EvidentSolution, Solved, ask
 from imu_calibration.calibration.coverage import Coverage, GroupState, Progress
 from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.table_calibration import solve_gathered
+from imu_calibration.calibration.table_calibration import solve_gathered, solve_in_passes
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.core.settings import setting
@@ -23,7 +23,6 @@ from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.references.turntable.gathered import Gathered
 from imu_calibration.references.turntable.window_store import WindowStore
-from imu_calibration.selection.linearisation import PASSES, linearise_again
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,18 +57,16 @@ class LiveSnapshot:
 
         If the windows are no longer kept, the gathered columns are used.
         """
-        model, total, moved = self.model, self.gathered, self.model_for(options)
-        check_units(total, model, self.table)
-        if not self.store.complete or moved.has_columns_of(model):
-            moved = model
-        for _ in range(PASSES):
-            if moved is not model:
-                model, total = moved, total.anew(self.store.reduced(moved, self.table, self.session))
-            solution = solve_gathered(total, model, options)
-            moved = linearise_again(model, solution)
-            if moved is None or not self.store.complete:
-                break
-        return solution, total, model
+        check_units(self.gathered, self.model, self.table)
+        if not self.store.complete:
+            return solve_gathered(self.gathered, self.model, options), self.gathered, self.model
+
+        def solved(model, judged_from):
+            known = model is self.model and judged_from == self.gathered.judged_from
+            total = self.gathered if known else self.gathered.anew(self.store.reduced(model, self.table, self.session), judged_from)
+            return solve_gathered(total, model, options), total
+        asked = self.model_for(options)
+        return solve_in_passes(self.model if asked.has_columns_of(self.model) else asked, options, solved)
 
     def evidence(self, asking: Callable | None = None) -> EvidentSolution:
         """Return the solution with the supported effects, as `calibrate_by_evidence`; `asking` is called with the completed share."""

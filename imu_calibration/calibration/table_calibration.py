@@ -94,6 +94,15 @@ def solve_recordings(sources: Sequence[Callable], table: Table, options: Calibra
         report('solving')
         return solve_gathered(gathered, model, options), gathered
 
+    return solve_in_passes(model, options, solved)
+
+
+def solve_in_passes(model: SensorModel, options: CalibrationOptions, solved: Callable) -> tuple[Solution, Gathered, SensorModel]:
+    """
+    Return (Solution, Gathered, SensorModel of the gathered columns) at the solution of a linearisation that is valid there.
+
+    ``solved(model, judged_from)`` returns (Solution, Gathered) with the columns of a model, and windows from that time on for the proof.
+    """
     again, judged_from = _at_time_constants(model, options, lambda trial: solved(trial, 0.0)), 0.0
     for _ in range(PASSES):
         model = again
