@@ -1,6 +1,7 @@
 """MPU-9150 by hand against published biases, and the angles of turns that were not used against two peers."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -18,7 +19,6 @@ TURNS = ('mpu9150_0', 'mpu9150_3')
 """Recordings whose left-out turns are compared."""
 
 
-
 def figures(folder):
     """Return (HandCalibration, bias difference from the published ones in m/s^2)."""
     imu = load(folder, NAME)
@@ -26,9 +26,8 @@ def figures(folder):
     return found, found.accelerometer[0] - reference(folder, NAME)['published']['accelerometer_bias']
 
 
-def ours_without(imu, ranges, gravity, without):
-    """Return (accelerometer, gyroscope) of a calibration by hand without the turns that overlap the slice `without`."""
-    data = gather_by_hand(imu, ranges)
+def ours_without(data, imu, ranges, gravity, without):
+    """Return (accelerometer, gyroscope) of a calibration by hand from `HandData` without the turns that overlap the slice `without`."""
     turns = [turn for turn in data.turns if data.poses.start[turn.last] <= without.start or data.poses.stop[turn.first] >= without.stop]
     found = solve_by_hand(replace(data, turns=turns), HandOptions(gravity))
     return Forward(*found.accelerometer), Forward(*found.gyroscope[:2])
@@ -41,19 +40,18 @@ def left_out_turns(imu, gravity):
     The angle is that between gravity after a turn and gravity before it, rotated by the corrected rates from the middle of one rest to
     the middle of the next. The directions of gravity are the same for all methods: those of the norm fit to all poses.
     """
-    ranges, squares = find_still(imu), {name: [] for name in METHODS}
+    ranges = find_still(imu)
+    methods = {'ours': partial(ours_without, gather_by_hand(imu, ranges)), 'imu_tk': imu_tk, 'imu-calib': imu_calib}
+    squares = {name: [] for name in methods}
     force = np.array([imu.force_s[rest].mean(axis=0) for rest in ranges])
     up, step = fit_norm(force, gravity).directions(force), 1e-9 * np.diff(imu.stamp_ns)
     middle = [(rest.start + rest.stop) // 2 for rest in ranges]
     for begin, end, before, after in zip(middle, middle[1:], up, up[1:]):
-        for name, method in METHODS.items():
+        for name, method in methods.items():
             gyroscope = method(imu, ranges, gravity, slice(begin, end))[1]
             rotated = turned(gyroscope.compensated(imu.rate_s[begin:end + 1]), step[begin:end]).T @ before
             squares[name].append(np.arctan2(np.linalg.norm(np.cross(rotated, after)), rotated @ after)**2)
     return {name: float(np.degrees(np.sqrt(np.mean(found)))) for name, found in squares.items()}
-
-
-METHODS = {'ours': ours_without, 'imu_tk': imu_tk, 'imu-calib': imu_calib}
 
 
 def run(folder, plots):
