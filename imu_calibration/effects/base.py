@@ -163,9 +163,14 @@ class Effect:
         return tuple(group for group, own in zip(self.groups, self.group_sensors) if own == sensor) if self.group_sensors else self.groups
 
     @property
+    def timed(self) -> bool:
+        """Whether its last component is a time constant or the time of a step."""
+        return self.time_constant or self.located
+
+    @property
     def n_amplitudes(self) -> int:
         """Number of components without the time constant or the time of a step."""
-        return self.size - (self.time_constant or self.located)
+        return self.size - self.timed
 
     @property
     def relinearised(self) -> bool:

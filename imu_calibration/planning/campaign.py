@@ -12,7 +12,6 @@ import numpy as np
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.settings import setting
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.effects.base import Role
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.status import HELD, tolerances_of
 from imu_calibration.kinematics.motion_limits import MotionLimits, limits_of
@@ -23,6 +22,7 @@ from imu_calibration.planning.planner import Planner
 from imu_calibration.planning.repertoire import Repertoire
 from imu_calibration.planning.situation import Situation
 from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.selection.questions import special
 from imu_calibration.simulation.profiles import make_profile
 
 SESSION = 'quick'
@@ -125,7 +125,7 @@ def _places(coordinates, key):
 
 def _require_shown_by_motion(model, key):
     effect = model.catalogue.find(*key, model.joint_names)
-    if effect.role is Role.LIMIT or effect.n_amplitudes < effect.size or 'temperature' in effect.needs:
+    if special(effect) or 'temperature' in effect.needs:
         raise InputError(f"effects that motion separates must depend on it, '{key[1]}' depends on time, temperature or range; "
                          'omit it')
 

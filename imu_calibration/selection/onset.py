@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.forward_equations import predict
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window, all_samples
+from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import LEAST_WINDOWS
 from imu_calibration.selection.explained_share import LEAST_SHARE, SIGNIFICANT_REST, Explained
 from imu_calibration.selection.normal_matrices import matrix_of_each
 from imu_calibration.selection.questions import Question
+from imu_calibration.selection.residual_blocks import residuals
 
 MARGIN = LEAST_WINDOWS + 1
 """Least number of moving windows before and after an onset: the longer part, without the window of the onset, can be searched."""
@@ -121,11 +121,8 @@ def _fit(total, own, small, changed=None):
 def _refined(windows, table, model, *, states, between):
     """Return the moment between two times at which the sum of squares of the residuals of both states is least."""
     near = [w for w in windows if w.time[-1] >= between[0] and w.time[0] <= between[1]]
-    motion, temperature, rows = all_samples(near)
-    outputs = (np.concatenate([w.force_s for w in near]), np.concatenate([w.rate_s for w in near]))
-    noise, squares = np.median([w.noise_sd for w in near], axis=0), []
-    for state in states:
-        made = predict(model, state[:len(model.param_names)], table, motion=motion, temperature_c=temperature)
-        squares.append(sum((((out - guess[rows]) / sd)**2).sum(axis=1) for out, guess, sd in zip(outputs, made, noise)))
+    noise = np.median([w.noise_sd for w in near], axis=0)
+    found = [residuals(near, table, model, values=state[:len(model.param_names)]) for state in states]
+    squares = [sum(((rest[sensor] / sd)**2).sum(axis=1) for sensor, sd in zip(SENSORS, noise)) for rest in found]
     time, cost = np.concatenate([w.time for w in near]), np.append(0.0, np.cumsum(squares[0] - squares[1]))
     return float(time[min(int(np.argmin(cost)), len(time) - 1)])

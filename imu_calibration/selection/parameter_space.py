@@ -187,7 +187,7 @@ def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray
     """Return a mask of the parameters that count from the linearisation: those of the baseline, time constants and times of steps."""
     masks = [np.full(e.size, e.key in baseline.slices) for e in model.effects]
     for effect, mask in zip(model.effects, masks):
-        if effect.n_amplitudes < effect.size:
+        if effect.timed:
             mask[-1] = True
     return np.concatenate(masks)
 

@@ -163,4 +163,4 @@ def without_saturation(effects: Sequence[Effect]) -> list[Effect]:
 
 def special(effect: Effect) -> bool:
     """Return whether an effect has no columns of its own: saturation (censoring), warm-up (bank of time constants), step (its time)."""
-    return effect.role is Role.LIMIT or effect.n_amplitudes < effect.size
+    return effect.role is Role.LIMIT or effect.timed

@@ -7,17 +7,18 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import References, columns, predict
+from imu_calibration.effects.forward_equations import References, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_at_rest import LEAST_NOISE
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window, all_samples, chunks
+from imu_calibration.preprocessing.window import Window, chunks
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import Explained
 from imu_calibration.selection.noise_beside_effects import natural_processes
 from imu_calibration.selection.questions import TEMPERATURE_SPAN
+from imu_calibration.simulation.session import predict_windows
 
 BLOCK = 0.25
 """Least length of a block of a moving window, s; at rest a window is one block."""
@@ -159,15 +160,9 @@ def _busier(windows, sensor, floor, kinds, judged):
 
 def residuals(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> dict[str, np.ndarray]:
     """Return sensor -> residual of every sample of all windows at some values, shape (n, 3): rows within blocks would be too coarse."""
-    parts = [_residuals(group, table, model, values) for group in chunks(windows)]   # columns take many times the memory of their samples
-    return {sensor: np.concatenate([part[sensor] for part in parts]) for sensor in SENSORS}
-
-
-def _residuals(windows, table, model, values):
-    motion, temperature, rows = all_samples(windows)
-    predicted = predict(model, values, table, motion=motion, temperature_c=temperature)
     outputs = (np.concatenate([w.force_s for w in windows]), np.concatenate([w.rate_s for w in windows]))
-    return {sensor: output - made[rows] for sensor, output, made in zip(SENSORS, outputs, predicted)}
+    predicted = [predict_windows(group, table, model, values=values) for group in chunks(windows)]   # columns need much memory
+    return {sensor: output - np.concatenate([part[sensor] for part in predicted]) for sensor, output in zip(SENSORS, outputs)}
 
 
 def _block_means(attempt, table, motion, temperature, starts):

@@ -103,7 +103,7 @@ def hidden_effect(model: SensorModel, name: str, seed: int = 0, *, share: float 
     values = share * effect.largest * rng.uniform(0.4, 1.0, effect.size) * rng.choice((-1.0, 1.0), effect.size)
     if effect.nonnegative:
         values = np.abs(values)
-    if effect.n_amplitudes < effect.size:
+    if effect.timed:
         values[-1] = 0.8 * effect.prior_values()[-1]
     return sensor, values
 
