@@ -52,7 +52,7 @@ def tiles(result: CalibrationResult, navigation: dict[str, Any]) -> list[dict[st
     if navigation['rest']:
         after, before = navigation['rest']['position'][::-1]
         found.append(_tile('position error after 50 s at rest', f'{after} m', f'{before} m',
-                           f"of it, from the calibration: {navigation['rest']['parts'][0][2]} m"))
+                           f"part of the calibration: {navigation['rest']['parts'][0][2]} m"))
     return found
 
 

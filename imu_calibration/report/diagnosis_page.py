@@ -7,6 +7,8 @@ import numpy as np
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, formula_gain
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult, beyond_lines
 from imu_calibration.core.units import for_people
+from imu_calibration.document.decision import DECISION, PARAMETERS
+from imu_calibration.document.verdict import judge
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
 from imu_calibration.report.drawn import Drawn
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, draw
@@ -48,6 +50,8 @@ def diagnosis_report(result: DiagnosisResult) -> str:
                           for line in (*(line for pair in diagnosis.unexplained.items() for line in beyond_lines(*pair)), *result.notes)],
                   spectra=[drawn for pair in diagnosis.unexplained.items() if (drawn := draw_tones(*pair))],
                   not_testable=list(diagnosis.not_testable),
+                  reasons=[reason for reason in judge(result.calibration, result.tolerances).reasons
+                           if reason.word in (DECISION, PARAMETERS)],
                   groups=parameter_groups(result), observations=result.observations, windows=diagnosis.windows, locked=diagnosis.locked,
                   bags=result.calibration.provenance.get('bags') or [], software=result.calibration.provenance.get('software', ''))
 
@@ -88,7 +92,7 @@ def _next_step(finding):
     if not finding.indistinguishable_from:
         return 'the extended calibration.yaml contains it'
     others = ', '.join(name.replace('_', ' ') for name in finding.indistinguishable_from)
-    return f'this recording cannot tell it from {others}; to separate them: {finding.separating_motion}'
+    return f'this recording does not separate it from {others}; to separate them: {finding.separating_motion}'
 
 
 def _tiles(diagnosis):
@@ -103,7 +107,7 @@ def _tiles(diagnosis):
     if navigation and diagnosis.findings:
         tiles.append({'what': f'position error after {text(navigation["seconds"], 2)} s', 'number': text(navigation['position_after']),
                       'unit': 'm', 'before': f'{text(navigation["position_before"])} m',
-                      'note': f'dead reckoning, median of {navigation["stretches"]} stretches'})
+                      'note': f'dead reckoning, runs: {navigation["stretches"]}, median'})
     return tiles
 
 

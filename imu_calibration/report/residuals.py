@@ -53,7 +53,7 @@ class _Windows:
             axes.axhline(0, color=GREY, lw=0.6)
             axes.set_ylabel(unit)
         lower.set_xlabel('time, s')
-        axis_legend(upper, 'lower right', bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
+        axis_legend(upper, 'lower right', bbox_to_anchor=(0.56, 1.0), borderaxespad=0.1)   # visible on a narrow screen without scrolling
 
     def _points(self, axes, values, hollow=False):
         for (name, colour), column in zip(AXIS.items(), values.T):

@@ -12,6 +12,7 @@ import pytest
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
@@ -162,3 +163,10 @@ def test_the_charts_have_the_data_of_each_sensor_and_axis(result):
                                    rtol=1e-4, atol=1e-12)
     assert charts[21]['kind'] == 'points' and charts[21]['x'].startswith('specific force')
     assert charts[24]['kind'] == 'log' and sum(charts[27]['data'][1]) > 0.95 * len(result.diagnosis.traces.time)
+
+
+def test_the_extended_calibration_has_its_decisions_and_the_motions_for_undetermined_parameters(result):
+    reasons = [reason for reason in result.calibration.judgement.reasons if reason.word in (DECISION, PARAMETERS)]
+    assert {reason.word for reason in reasons} == {DECISION, PARAMETERS}
+    section = unescape(diagnosis_report(result)).partition('<section id="parameters">')[2]
+    assert all(text[1:] in section for reason in reasons for text in (reason.what, reason.advice()) if text)
