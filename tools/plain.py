@@ -24,16 +24,16 @@ beside behind apart far whole stay stays stayed come comes came go goes went gon
 take takes took taken look looks looked word words people chance chances story say-so
 """.split())
 SENTENCE = re.compile(r'(?<=[.!?;:])\s+')
-CODE = re.compile(r'```.*?```|``[^`]*``|`[^`]*`|https?://\S+|<[^>]+>', re.S)
+CODE = re.compile(r'```.*?```|``[^`]*``|`[^`]*`|https?://\S+|<style.*?</style>|\{[{%].*?[}%]\}|<[^>]+>', re.S)
 
 
 def texts(path):
-    """Yield (kind, line, text) of one Python or Markdown file."""
+    """Yield (kind, line, text) of one Python or Markdown file or HTML template."""
     source = path.read_text(encoding='utf8')
     if path.suffix != '.py':
         for number, line in enumerate(CODE.sub(lambda m: '\n' * m.group().count('\n'), source).splitlines(), 1):
             if line.strip() and not line.lstrip().startswith('|'):
-                yield 'page', number, line
+                yield 'message' if path.suffix == '.html' else 'page', number, line
         return
     tree = ast.parse(source)
     bare = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
@@ -58,7 +58,7 @@ def files(root):
     if root.is_file():
         return [root]
     skip = {'test', 'build', 'install', 'validation', 'tools'}
-    found = [path for path in root.rglob('*.py')
+    found = [path for pattern in ('*.py', '*.html') for path in root.rglob(pattern)
              if not any(part in skip or part.startswith('.') for part in path.relative_to(root).parts)]
     found += [p for p in [root / 'README.md', root / 'CONTRIBUTING.md'] if p.exists()]
     return sorted(found) + sorted((root / 'docs').rglob('*.md'))
@@ -103,7 +103,8 @@ def main():
     rates = {kind: 1000 * numbers[1] / max(numbers[0], 1) for (group, kind), numbers in count.items() if group == 'all'}
     above = [f'{rate:.2f} in {kind}s (limit {MOST[kind]:g})' for kind, rate in rates.items() if rate > MOST[kind]]
     if arguments.root.is_dir() and above:
-        sys.exit(f'Too many marker words per 1,000 words: {", ".join(above)}. Rewrite the sentences that `tools/plain.py --worst 20` prints.')
+        sys.exit(f'Too many marker words per 1,000 words: {", ".join(above)}. '
+                 'Rewrite the sentences that `tools/plain.py --worst 20` prints.')
 
 
 if __name__ == '__main__':
