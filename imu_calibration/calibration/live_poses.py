@@ -41,7 +41,7 @@ class LiveByHand:
     One live session without a table: `push` arriving samples, `solve` when due.
 
     The samples are cleaned, searched and solved by the functions for recordings, and all are kept up to the memory limit: the result
-    equals `workflow.calibrate_without_table` on the same samples. Beyond the limit (`hand_samples`) it is the result for the
+    equals `calibrate_without_table` on the same samples. Beyond the limit (`hand_samples`) it is the result for the
     kept samples. A clock reset, for which a recording is refused, is treated as a pause.
 
     Parameters

@@ -69,7 +69,7 @@ class ErrorBudget:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationResult(ABC):
-    """A calibration with the data for a report: on a table a `TableResult`, by hand a `by_hand.result.HandResult`."""
+    """A calibration with the data for a report: on a table a `TableResult`, by hand a `HandResult`."""
 
     calibration: Calibration
     """The document's content."""

@@ -146,7 +146,7 @@ class Calibration:
     def compensate(self, samples: ImuSamples | np.ndarray, rate_s: np.ndarray | None = None, *, time: np.ndarray | None = None,
                    temperature_c: Any = None) -> ImuSamples | tuple[np.ndarray, np.ndarray]:
         """
-        Return readings with the calibrated errors removed; see `compensation.arrays.compensate_readings`.
+        Return readings with the calibrated errors removed; see `compensate_readings`.
 
         Parameters
         ----------

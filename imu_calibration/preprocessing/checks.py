@@ -218,7 +218,7 @@ CHECKS = (
 
 class Preflight:
     """
-    Watches a recording while it is read (a `segmentation.block_cleaning.Watcher`).
+    Watches a recording while it is read (a `Watcher`).
 
     Parameters
     ----------

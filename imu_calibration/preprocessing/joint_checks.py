@@ -126,7 +126,7 @@ WORDS = {'accelerometer': ('specific force at rest', 'gravity in the attitudes o
 
 
 class Reduced(Protocol):
-    """Reduced data of a recording: `calibration.gathered.Gathered`."""
+    """Reduced data of a recording: `Gathered`."""
 
     @property
     def accumulator(self) -> Any:

@@ -33,7 +33,7 @@ def diagnosis_report(result: DiagnosisResult) -> str:
 
     Parameters
     ----------
-    result : workflow_diagnosis.DiagnosisResult
+    result : DiagnosisResult
 
     """
     diagnosis = result.diagnosis

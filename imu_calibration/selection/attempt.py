@@ -125,7 +125,7 @@ class Attempt:
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """
-        Return whether both halves of the recording show an effect alike (`halves.agree`).
+        Return whether both halves of the recording show an effect alike (`evidence.agree`).
 
         Effects that are smooth in time are different in the halves by nature.
         """

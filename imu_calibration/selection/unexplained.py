@@ -48,11 +48,11 @@ class Unexplained:
     axes: tuple = ()
     """Axes of the sensor that carry it, the strongest first."""
     regimes: tuple = ()
-    """Conditions under which it appears (`beyond.regimes.RestRegime`), at most one for each axis."""
+    """Conditions under which it appears (`RestRegime`), at most one for each axis."""
     proposal: Any = None
-    """Formula that it follows (`beyond.proposals.Proposal`), or None."""
+    """Formula that it follows (`Proposal`), or None."""
     tones: tuple = ()
-    """Fixed frequencies and fixed multiples of a joint's speed in it (`beyond.spectrum.Tone`), the surest first."""
+    """Fixed frequencies and fixed multiples of a joint's speed in it (`Tone`), the surest first."""
 
 
 def unexplained(attempt: Attempt, explained: Explained, chosen: Sequence[Question]) -> dict[str, Unexplained]:

@@ -131,7 +131,7 @@ class LiveSimulation:
 
 
 class _Wander:
-    """The first-order Gauss-Markov bias of `noise.gauss_markov`, continued from block to block."""
+    """The first-order Gauss-Markov bias of `gauss_markov`, continued from block to block."""
 
     def __init__(self, sd, correlation_time, step, rng):
         self._decay, self._rng = np.exp(-step / correlation_time), rng

@@ -26,7 +26,7 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
     ----------
     calibration : Calibration or path-like
     to : str
-        Name of the target, as `document.exports.export.all_targets` lists them.
+        Name of the target, as `all_targets` lists them.
     output : path-like, optional
         The file; None: no file is written.
     noise : path-like, optional
@@ -34,7 +34,7 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
     rate : float, optional
         Rate at which the target gets the readings, Hz; default that of the noise document.
     bag : path-like, optional
-        Recording on which the loss is measured; default `document.exports.loss.standard_motion`.
+        Recording on which the loss is measured; default `standard_motion`.
     stand : path-like, Table or Arm, optional
         Reference of the true motion of the recording; default its compensated readings.
     topics : Topics

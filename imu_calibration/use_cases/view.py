@@ -283,7 +283,7 @@ class View:
     calibration: Calibration
     """The calibration."""
     contents: dict[str, dict[str, Any]]
-    """Topic -> content, as in `foxglove_file.SCHEMAS`."""
+    """Topic -> content, as in `SCHEMAS`."""
     coverage: Coverage | None
     """The sphere; None where only a file is known."""
     seconds: float = 0.0

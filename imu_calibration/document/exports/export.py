@@ -64,7 +64,7 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     rate : float, optional
         Rate at which the target gets the readings, Hz; default that of the noise document.
     motion : TrialMotion, optional
-        Where the loss is measured; default `motion.standard_motion`.
+        Where the loss is measured; default `standard_motion`.
     anyway : bool
         Also the numbers of a sensor whose decision is `harms`.
 
@@ -89,7 +89,7 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
              *(f'note: {hint}' for hint in [target.hint] if hint)]
     head = [f'{target.title}, written by imu_calibration {imu_calibration.__version__}', *target.formula.splitlines(), f'({target.source})']
     rate = rate or (noise.rate if noise else None)
-    assert target.write is not None   # `registry.find_target` gives no other
+    assert target.write is not None   # `find_target` gives no other
     content = target.write(Page(numbers, found, [*head, *lines], applied, rate))
     return Export(content.encode() if isinstance(content, str) else content, numbers, placement, loss, tuple(lines), used.refused)
 

@@ -235,7 +235,7 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
         When it is no such file, or its numbers can belong to no IMU.
 
     """
-    assert target.read is not None   # `registry.find_reader` gives no other
+    assert target.read is not None   # `find_reader` gives no other
     found = target.read(content, path)
     if target.whole:
         return from_mapping(found.numbers)

@@ -146,7 +146,7 @@ def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), sti
     options : HandOptions
         Reference, effects, tolerances.
     stills : sequence of slices or (start, stop), optional
-        Intervals at rest; found by `static_detector.find_still` when not given.
+        Intervals at rest; found by `find_still` when not given.
     known_turns : sequence of KnownTurn
         Full turns by hand, in addition to gravity as reference.
     temperature_c : array, optional

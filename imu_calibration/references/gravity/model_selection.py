@@ -77,7 +77,7 @@ class Inquiry:
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """
-        Return whether the estimates of an effect from the poses before and after the middle agree (`halves.agree`).
+        Return whether the estimates of an effect from the poses before and after the middle agree (`evidence.agree`).
 
         Effects that are smooth in time differ by nature.
         """

@@ -86,7 +86,7 @@ class Gathered:
     temperature_c: tuple | None = None
     """Lowest and highest temperature."""
     findings: tuple = ()
-    """Findings of the checks of the recording before the estimate (`preflight.finding.CheckFinding`)."""
+    """Findings of the checks of the recording before the estimate (`CheckFinding`)."""
 
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
