@@ -19,7 +19,7 @@ SAMPLE = ROOT / 'bags' / 'sample_session'
 START = {'simulator_node': {'profile': 'none', 'table_file': TABLE}, 'bag_player_node': {'bag': SAMPLE, 'wait_for_subscribers': 100},
          'planner_node': {'table_file': TABLE}, 'calibration_node': {'table_file': TABLE}, 'compensator_node': {}}
 TOPICS = {
-    'calibration_node': ('/imu/data_raw, /imu/temperature', '/imu/calibration, /imu/residual, /imu/coverage'),
+    'calibration_node': ('/imu/data_raw, /joint_states, /imu/temperature', '/imu/calibration, /imu/residual, /imu/coverage'),
     'compensator_node': ('/raw, /imu/calibration, /imu/temperature', '/imu/data_corrected'),
     'planner_node': ('/joint_states, /imu/calibration, /diagnostics', '/joint_trajectory, /imu/coverage'),
     'simulator_node': ('/joint_trajectory', '/imu/data_raw, /joint_states'), 'bag_player_node': ('/imu/data_raw, /joint_states',)}

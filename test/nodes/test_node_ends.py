@@ -48,8 +48,9 @@ def end():
     time.sleep(20.0)
     os._exit(3)
 def make():
+    node = rclpy.create_node('idle')
     threading.Thread(target=end, daemon=True).start()
-    return rclpy.create_node('idle')
+    return node
 sys.exit(run_node(make, []))
 '''
 

@@ -39,7 +39,7 @@ def test_make_config_writes_what_is_missing_and_leaves_the_rest(tmp_path, capsys
     for node in NODES[1:]:
         (tmp_path / f'{node}.yaml').write_text(rendered(node))
     main(tmp_path)
-    assert capsys.readouterr().out == f'written: {tmp_path}/{NODES[0]}.yaml\n'
+    assert f'{tmp_path}/{NODES[0]}.yaml' in capsys.readouterr().out
     assert (tmp_path / f'{NODES[0]}.yaml').read_text() == rendered(NODES[0])
 
 
