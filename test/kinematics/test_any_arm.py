@@ -118,23 +118,20 @@ def test_an_unknown_place_takes_the_standard_gravity_and_its_doubt():
     assert table_from_urdf(SIX_AXES, 'imu_link', {'latitude': 45.0}).gravity is None
 
 
-@pytest.mark.parametrize('text, link, said', [
-    ('<robot', 'imu_link', 'a robot description must be a URDF'),
-    ('<sdf/>', 'imu_link', 'its outermost element is <sdf>'),
-    ('', 'imu_link', 'a robot description must be a URDF'),
-    (SIX_AXES, 'imu', "must hold the link 'imu' that carries the IMU, it holds base_link, camera_link"),
-    (SIX_AXES, 'camera_link', "the link 'camera_link' must be moved by at least one joint, it is fixed to the root 'base_link'"),
-    (SIX_AXES, 'base_link', "the link 'base_link' must be moved by at least one joint"),
-    (robot(joint('free', 'base_link', 'imu_link', kind='floating')), 'imu_link', "'free' is floating"),
-    (robot(joint('a', 'base_link', 'imu_link', extra='<mimic joint="nobody"/>')), 'imu_link', "it mimics 'nobody'"),
-    (robot(joint('a', 'base_link', 'imu_link', axis='0 0 0')), 'imu_link', "axis of joint 'a' must not be zero"),
-    (robot(joint('a', 'base_link', 'imu_link', xyz='0 0')), 'imu_link', 'a robot description must be a URDF'),
-    (robot(joint('a', 'imu_link', 'b'), joint('c', 'b', 'imu_link')), 'imu_link', 'form a circle'),
+@pytest.mark.parametrize('text, link, values', [
+    ('<robot', 'imu_link', ['URDF', 'line 1']), ('<sdf/>', 'imu_link', ['URDF', '<sdf>']), ('', 'imu_link', ['URDF']),
+    (SIX_AXES, 'imu', ["'imu'", 'base_link, camera_link']), (SIX_AXES, 'camera_link', ["'camera_link'", "'base_link'"]),
+    (SIX_AXES, 'base_link', ["'base_link'"]),
+    (robot(joint('free', 'base_link', 'imu_link', kind='floating')), 'imu_link', ["'free'", 'floating']),
+    (robot(joint('a', 'base_link', 'imu_link', extra='<mimic joint="nobody"/>')), 'imu_link', ["'a'", "'nobody'"]),
+    (robot(joint('a', 'base_link', 'imu_link', axis='0 0 0')), 'imu_link', ["'a'", [0.0, 0.0, 0.0]]),
+    (robot(joint('a', 'base_link', 'imu_link', xyz='0 0')), 'imu_link', ['URDF', "'a'"]),
+    (robot(joint('a', 'imu_link', 'b'), joint('c', 'b', 'imu_link')), 'imu_link', ["'b'"]),
 ])
-def test_what_is_no_chain_is_refused_in_one_line(text, link, said):
-    with pytest.raises(InputError) as refused:
+def test_what_is_no_chain_is_refused_in_one_line(text, link, values):
+    with pytest.raises(InputError) as caught:
         table_from_urdf(text, link, SITE)
-    assert said in str(refused.value) and '\n' not in str(refused.value)
+    assert all(str(value) in str(caught.value) for value in values) and '\n' not in str(caught.value)
 
 
 def test_a_site_may_only_name_joints_on_the_way():
@@ -144,18 +141,13 @@ def test_a_site_may_only_name_joints_on_the_way():
         table_from_urdf(SIX_AXES, 'imu_link', SITE | {'joints': [{'name': 'lift', 'range_m': [0, 1]}]})
 
 
-@pytest.mark.parametrize('changes, said', [
-    ({'type': 'planar'}, "type of joint 'a' must be revolute or prismatic"),
-    ({'range_deg': [10, -10]}, "range of joint 'a' must be a smaller and a larger number"),
-    ({'range_deg': 10}, "range_deg of joint 'a' must be two numbers"),
-    ({'speed_deg_s': 0}, "largest speed of joint 'a' must be above zero"),
-    ({'type': 'prismatic', 'range_deg': [0, 1]}, "key 'range_deg' is unknown"),
-    ({'mimic': {'joint': 'b'}}, "joint 'a' must follow a joint that moves by itself"),
-    ({'mimic': 'b'}, "mimic of joint 'a' must be a mapping"),
-    ({'mimic': {'multiplier': 2}}, "mimic of joint 'a' must name a joint"),
+@pytest.mark.parametrize('changes, values', [
+    ({'type': 'planar'}, ["'a'", "'planar'"]), ({'range_deg': [10, -10]}, ["'a'", 0.1745, -0.1745]), ({'range_deg': 10}, ["'a'", 'range_deg', 10]),
+    ({'speed_deg_s': 0}, ["'a'", 'got 0']), ({'type': 'prismatic', 'range_deg': [0, 1]}, ["'range_deg'", 'range_m']),
+    ({'mimic': {'joint': 'b'}}, ["'a'", "'b'"]), ({'mimic': 'b'}, ['mimic', "'a'", "'b'"]), ({'mimic': {'multiplier': 2}}, ['mimic', "'a'", 'None']),
 ])
-def test_joints_that_cannot_be_are_refused(changes, said):
+def test_joints_that_cannot_be_are_refused(changes, values):
     joints = [{'name': 'a', 'axis': [0, 0, 1]} | changes, {'name': 'b', 'axis': [0, 1, 0], 'mimic': {'joint': 'c'}}]
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         Table.from_mapping({'joints': joints, 'gravity': 9.81})
-    assert said in str(refused.value)
+    assert all(str(value) in str(caught.value) for value in values), str(caught.value)
