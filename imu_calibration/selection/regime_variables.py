@@ -2,51 +2,84 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES
-from imu_calibration.selection.residual_blocks import RestBlocks
+from imu_calibration.selection.residual_blocks import RestBlocks, block_means
 
 FEWEST = 6
 """Blocks that a regime holds at least."""
 N_BINS = 24
+ORDER = 3
+"""Order of smooth functions of a variable."""
 MOST_BOUNDS = 16
 """Places at which a range is tried to begin, and to end, about the edge of a bin."""
 
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """A variable of regimes: a bin for each block, and the description of a range of values."""
+    """A variable of regimes at the rows of all blocks, in bins, and the description of a range of values."""
 
     name: str
     bins: np.ndarray
+    """Bin of each row, shape (n,)."""
     edges: np.ndarray
     """Where bins begin, and where the last one ends; none for classes."""
     cyclic: bool
     words: Callable
     """``words(chosen, bounds)``: the condition, from the bins in order and where they begin and end."""
     values: np.ndarray
-    """Value of each block, in the unit of the edges; none for classes."""
+    """Value at each row, in the unit of the edges, shape (n,)."""
+    starts: np.ndarray
+    """First row of each block, shape (b,)."""
 
     @property
     def marks(self) -> np.ndarray:
-        """One column for each bin, 1 in the blocks that lie there, shape (b, k)."""
-        return np.eye(int(self.bins.max()) + 1)[self.bins]
+        """Share of each block in each bin, shape (b, k)."""
+        return block_means(np.eye(int(self.bins.max()) + 1)[self.bins], self.starts)
+
+    @property
+    def ranges(self) -> np.ndarray:
+        """Ranges of neighbouring bins, 1 in each bin of a range, the shortest first, shape (r, k)."""
+        count, places = int(self.bins.max()) + 1, np.arange(int(self.bins.max()) + 1)
+        parts = [(places - first) % count < length for length in range(1, count) for first in range(count)
+                 if self.cyclic or first + length <= count]
+        return np.array(parts, float).reshape(-1, count)
+
+    @property
+    def curves(self) -> np.ndarray:
+        """Means over the blocks of smooth functions of the variable, cubic or of the third order; none of classes; shape (b, k)."""
+        if not len(self.edges):
+            return np.zeros((len(self.starts), 0))
+        if self.cyclic:
+            turns = np.arange(1, ORDER + 1) * (self.values * DEG)[:, None]
+            return block_means(np.concatenate([np.cos(turns), np.sin(turns)], axis=1), self.starts)
+        low, high = self.values.min(), self.values.max()
+        return block_means(np.polynomial.legendre.legvander(2 * (self.values - low) / (high - low) - 1, ORDER)[:, 1:], self.starts)
+
+    def chosen(self, member: np.ndarray) -> list[int]:
+        """Return the bins of a range, in order."""
+        bins = np.flatnonzero(member)
+        gap = np.flatnonzero(np.diff(bins) > 1)   # a cyclic range may begin beyond where it ends
+        return np.roll(bins, -gap[0] - 1).tolist() if len(gap) else bins.tolist()
 
     def bounds(self, chosen: Sequence[int]) -> tuple[float, float] | None:
         """Return where a range of bins begins and ends, or None for classes."""
         return (float(self.edges[chosen[0]]), float(self.edges[chosen[-1] + 1])) if len(self.edges) else None
 
     def inside(self, low: float, high: float) -> np.ndarray:
-        """Return the mask of blocks with a value between two bounds, the last range open at its end, shape (b,)."""
+        """Return the share of each block between two bounds, the first and the last range open at their ends, shape (b,)."""
         if self.cyclic:
-            return (self.values - low) % 360.0 < ((high - low) % 360.0 or 360.0)
-        return ((self.values >= low) | (low <= self.edges[0])) & ((self.values < high) | (high >= self.edges[-1]))
+            rows = (self.values - low) % 360.0 < ((high - low) % 360.0 or 360.0)
+        else:
+            rows = ((self.values >= low) | (low <= self.edges[0])) & ((self.values < high) | (high >= self.edges[-1]))
+        return block_means(rows.astype(float), self.starts)
 
     def near(self, chosen: Sequence[int], end: int) -> list[float]:
-        """Return where a range of bins may begin (`end` 0) or end (1): between blocks that lie in the bins on both sides, evenly spread."""
+        """Return where a range of bins may begin (`end` 0) or end (1): between values that lie in the bins on both sides, evenly spread."""
         first = chosen[0] if end == 0 else chosen[-1] + 1
         if not self.cyclic and first in (0, len(self.edges) - 1):
             return []
@@ -60,31 +93,32 @@ class Variable:
 
 def variables_of(blocks: RestBlocks, joint_names: Sequence[str]) -> list[Variable]:
     """Return the variables of regimes in this recording; the first is reported among equals."""
-    ref, found = blocks.ref, []
-    angles, rates = blocks.means(ref.joint_angle), blocks.means(ref.joint_rate)
+    ref, starts, found = blocks.ref, blocks.starts, []
+    each = partial(ranged, starts=starts)
     for k, name in enumerate(joint_names):
-        if np.ptp(angles[:, k]) > 0.5:
-            found.append(_cyclic(f'angle of {name}', angles[:, k] / DEG))
-        found += ranged(f'rate of {name}', rates[:, k] / DEG, 'deg/s')
-        found += _before_rest(name, rates[:, k])
-    speed, force = np.linalg.norm(blocks.means(ref.rate_s), axis=1), np.linalg.norm(blocks.means(ref.force_s), axis=1)
-    found += ranged('speed', speed / DEG, 'deg/s') + ranged('specific force', force, 'm/s^2', least=0.5)
+        if np.ptp(ref.joint_angle[:, k]) > 0.5:
+            found.append(_cyclic(f'angle of {name}', ref.joint_angle[:, k] / DEG, starts))
+        found += each(f'rate of {name}', ref.joint_rate[:, k] / DEG, 'deg/s')
+        found += each(f'speed of {name}', np.abs(ref.joint_rate[:, k]) / DEG, 'deg/s')
+        found += _before_rest(name, ref.joint_rate[:, k], starts)
+    speed = np.linalg.norm(ref.rate_s, axis=1)
+    found += each('speed', speed / DEG, 'deg/s') + each('specific force', np.linalg.norm(ref.force_s, axis=1), 'm/s^2', least=0.5)
     for k, axis in enumerate(AXES):
-        found += ranged(f'rate about {axis}', blocks.means(ref.rate_s)[:, k] / DEG, 'deg/s')
-        found += ranged(f'specific force along {axis}', blocks.means(ref.force_s)[:, k], 'm/s^2', least=0.5)
-    found += ranged('time', blocks.time, 's')
+        found += each(f'rate about {axis}', ref.rate_s[:, k] / DEG, 'deg/s')
+        found += each(f'specific force along {axis}', ref.force_s[:, k], 'm/s^2', least=0.5)
+    found += each('time', ref.time, 's')
     if blocks.warms and ref.temperature_c is not None:
-        warm = blocks.means(ref.temperature_c)
-        found += ranged('temperature', warm, 'C', least=0.5)
-        slope = np.gradient(np.polynomial.Chebyshev.fit(blocks.time, warm, min(12, len(warm) // 10))(blocks.time))
-        found += _classes('temperature', slope > 0, ('while it cools', 'while it warms up'))
+        warm = ref.temperature_c
+        found += each('temperature', warm, 'C', least=0.5)
+        slope = np.gradient(np.polynomial.Chebyshev.fit(ref.time, warm, min(12, len(warm) // 10))(ref.time))
+        found += _classes('temperature', slope > 0, ('while it cools', 'while it warms up'), starts)
     moving = speed > DEG
-    found += _classes('kind', moving, ('at rest', 'while it moves'))
-    last = np.maximum.accumulate(np.where(moving, blocks.time, -np.inf))
-    return found + ranged('time since motion', np.where(np.isfinite(last), np.minimum(blocks.time - last, 1e3), 1e3), 's')
+    found += _classes('kind', moving, ('at rest', 'while it moves'), starts)
+    last = np.maximum.accumulate(np.where(moving, ref.time, -np.inf))
+    return found + each('time since motion', np.where(np.isfinite(last), np.minimum(ref.time - last, 1e3), 1e3), 's')
 
 
-def _before_rest(name, rate):
+def _before_rest(name, rate, starts):
     """Return from which side a joint reached its rest."""
     moving = np.abs(rate) > 0.5 * DEG
     side = np.where(moving, np.sign(rate), 0.0)
@@ -92,21 +126,22 @@ def _before_rest(name, rate):
     came = np.where(place >= 0, side[np.maximum(place, 0)], 0.0)
     if min((came > 0).sum(), (came < 0).sum()) < FEWEST:
         return []
-    return _classes(f'approach of {name}', came > 0, (f'after {name} turned backwards', f'after {name} turned forwards'))
+    return _classes(f'approach of {name}', came > 0, (f'after {name} turned backwards', f'after {name} turned forwards'), starts)
 
 
-def _cyclic(name, degrees):
+def _cyclic(name, degrees, starts):
     edges = np.linspace(0.0, 360.0, N_BINS + 1)
 
     def words(_, bounds):
         low, high = (round(bound % 360.0) % 360 if bound != 360.0 else 360 for bound in bounds)
         return f'while the {name} is {low} to {high} deg'
-    return Variable(name, np.minimum((degrees % 360.0 / 360.0 * N_BINS).astype(int), N_BINS - 1), edges, True, words, degrees % 360.0)
+    bins = np.minimum((degrees % 360.0 / 360.0 * N_BINS).astype(int), N_BINS - 1)
+    return Variable(name, bins, edges, True, words, degrees % 360.0, starts)
 
 
-def ranged(name: str, values: np.ndarray, unit: str, *, least: float = 1e-3) -> list[Variable]:
-    """Return the variable of a value of each block in bins of equal numbers of blocks, or none where it hardly changes."""
-    edges = np.unique(np.round(np.quantile(values, np.linspace(0.0, 1.0, N_BINS + 1)), 3))
+def ranged(name: str, values: np.ndarray, unit: str, *, starts: np.ndarray, least: float = 1e-3) -> list[Variable]:
+    """Return the variable of a value at each row in bins of equal numbers of blocks, or none where it hardly changes."""
+    edges = np.unique(np.round(np.quantile(block_means(values, starts), np.linspace(0.0, 1.0, N_BINS + 1)), 3))
     if len(edges) < 4 or np.ptp(edges) < least:
         return []
 
@@ -117,10 +152,10 @@ def ranged(name: str, values: np.ndarray, unit: str, *, least: float = 1e-3) -> 
         span = f'{low:.3g} {unit} or more' if chosen[-1] == len(edges) - 2 else f'{low:.3g} to {high:.3g} {unit}'
         return f'while the {name} is {span}'
     bins = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
-    return [Variable(name, bins, edges, False, words, values)]
+    return [Variable(name, bins, edges, False, words, values, starts)]
 
 
-def _classes(name, mask, words):
-    if not FEWEST <= mask.sum() <= len(mask) - FEWEST:
+def _classes(name, mask, words, starts):
+    if not FEWEST <= block_means(mask.astype(float), starts).sum() <= len(starts) - FEWEST:
         return []
-    return [Variable(name, mask.astype(int), np.zeros(0), False, lambda chosen, _: words[chosen[0]], np.zeros(0))]
+    return [Variable(name, mask.astype(int), np.zeros(0), False, lambda chosen, _: words[chosen[0]], mask.astype(float), starts)]

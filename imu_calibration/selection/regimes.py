@@ -1,33 +1,48 @@
-"""Regimes of the motion that contain most of a sensor's residual, found on every other window and tested on the remaining ones."""
+"""Regimes of the motion that contain most of a sensor's residual: permutation test, and comparison with smooth curves and formulas."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from imu_calibration.core.distributions import f_sf
+from imu_calibration.core.constants import DEG
 from imu_calibration.effects.base import AXES
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.regime_variables import FEWEST, variables_of
+from imu_calibration.selection.regime_variables import FEWEST, Variable, variables_of
 from imu_calibration.selection.residual_blocks import RestBlocks
 
-FALSE_DISCOVERIES = 0.05
-"""False discovery rate of reported regimes."""
-MOST_OF_IT, MUCH_OF_IT = 0.8, 0.5
-"""Least share of the excess in a regime, and least share that an offset in it removes, which the bin width reduces."""
+BY_CHANCE = 0.05
+"""Probability that a recording without a place has one reported, for all axes of a sensor together."""
+PERMUTED = 199
+"""Random exchanges of the residual between windows."""
+INTENSITIES, LEAST_ALIKE = 3, 4
+"""Classes of motion intensity within a kind of window, at most, and windows of each, at least: the residual is exchanged within them."""
+MOST_OF_IT = 0.8
+"""Least share of the excess that an offset in a regime removes, or that lies in a regime of larger scatter."""
 NEARLY_ALL = 0.95
 """Share of the scatter of a range in its reported part."""
-ALIKE = 16.0
-"""Twice the difference of log likelihood, nats, up to which the order of variables decides: joints before the sensor."""
+ALIKE = 0.01
+"""Difference of the shares of two regimes up to which the order of variables decides: joints before the sensor."""
+SURE = 16.0
+"""Least advantage of a regime over a smooth curve or a formula, twice the difference of log likelihood, nats."""
+LOUDER = 1.5
+"""Least ratio of the variances inside and outside of a regime of larger scatter."""
 WIDEST = 0.6
 """Largest share of the blocks in a regime; a larger one does not localise the residual."""
+REPORTED = 4
+"""Variables whose likeliest range is described, at most."""
+SCORINGS = 12
+"""Steps of the fit of a variance that is a smooth function of a variable."""
+LARGEST = 1e3
+"""Largest ratio of a square and its variance in a step, which limits the influence of few residuals."""
 TINY = 1e-9
 """Keeps columns that a part of the recording does not have from making a system singular."""
 
 
 @dataclass(frozen=True, eq=False)
 class RestRegime:
-    """One condition under which the rest of one axis appears."""
+    """One condition under which the residual of one axis appears."""
 
     sensor: str
     """'accelerometer' or 'gyroscope'."""
@@ -38,243 +53,314 @@ class RestRegime:
     text: str
     """Description of the condition."""
     share: float
-    """Share of the axis' rest that lies in it, on windows that it was not found on."""
+    """Share of the axis' excess that an offset there removes, or that lies there."""
     p_value: float
-    """Probability of the contrast by noise."""
+    """Probability of an equal gain with the residual exchanged between windows, for all ranges of all variables."""
+    size: float
+    """Offset, or sd of the additional scatter, m/s^2 or rad/s."""
     inside: np.ndarray
-    """Whether each block lies in it, shape (b,)."""
+    """Whether most of each block lies in it, shape (b,)."""
     time: np.ndarray
     """Middle of each block, s, shape (b,)."""
     offset: bool
     """Whether the output differs by a constant offset there; the complement could then have it as well."""
-    cost: float
-    """Minus twice the log likelihood of the test windows: the smallest is reported first."""
     bounds: tuple[float, float] | None
     """Where it begins and ends, SI or degrees for angles; an angle may begin beyond where it ends."""
-    bins: tuple = ()
-    """Bins of the variable that it was found in, in order."""
 
     def to_mapping(self) -> dict:
         """Return the regime as plain data."""
-        return {'axis': self.axis, 'variable': self.variable, 'text': self.text, 'share': self.share, 'p_value': self.p_value,
+        return {'axis': self.axis, 'variable': self.variable, 'text': self.text, 'share': self.share, 'p_value': self.p_value, 'size': self.size,
                 'bounds': None if self.bounds is None else list(self.bounds)}
 
 
-def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, joint_names: Sequence[str]) -> list[RestRegime]:
+def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, joint_names: Sequence[str], axes: Sequence[str] = AXES,
+                 formula: np.ndarray | None = None) -> list[RestRegime]:
     """
-    Return the regimes of a sensor's axes, the clearest of each axis first.
+    Return the regimes of a sensor's axes, the likeliest of each axis first.
 
-    For every range of every variable either the model is fitted outside and the blocks inside have additional scatter, or the blocks
-    inside have a separate offset. The likeliest range is found on every other window and tested on the remaining ones, by an F test with
-    windows as degrees of freedom. The false discovery rate of all tests is 5 %. The bounds of an offset
-    are refined on all windows to between blocks, with p-values times the number of trials: one window on the wrong side of a step
-    hides all of it. For scatter the shortest part with nearly all of it is reported.
+    Parameters
+    ----------
+    blocks : RestBlocks
+    attempt : Attempt
+    used : sequence of int
+        Parameters of the model.
+    joint_names : sequence of str
+    axes : sequence of str
+        Axes with an excess over noise, on which an offset is searched.
+    formula : ndarray, shape (b, k, 3), optional
+        Columns of a formula for the residual, which a regime must exceed.
+
     """
-    variables = variables_of(blocks, joint_names)
-    white = blocks.whitener(np.ones(len(blocks.time), bool))
-    axes = [_AxisRest(blocks, axis, attempt, used=used, white=white) for axis in range(3)]
-    found = [(rest, variable, regime) for rest in axes for variable in variables for regime in rest.regimes(variable)]
-    limit = _few_false([regime.p_value for *_, regime in found])
-    sharp = [rest.sharpened(variable, regime) for rest, variable, regime in found if regime.p_value <= limit]
-    kept = [regime for regime in sharp if regime.p_value <= limit and regime.share >= (MUCH_OF_IT if regime.offset else MOST_OF_IT)]
-    return [regime for axis in AXES for regime in _likeliest_first([each for each in kept if each.axis == axis])]
+    exchange = exchanges(blocks.window, attempt.recording.kind[blocks.window], np.linalg.norm(blocks.means(blocks.ref.rate_s), axis=1))
+    search, level = RegimeSearch(blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange), BY_CHANCE / len(AXES)
+    white, found = blocks.whitener(np.ones(len(blocks.time), bool)) if len(axes) else None, []
+    for axis, name in enumerate(AXES):
+        offsets = []
+        if name in axes:
+            at = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
+            own, scaled = blocks.index[axis][at], partial(_scaled, white, white.scale[axis])
+            rest = Rest(scaled(blocks.design[axis][:, [*at, -1]]), 1 / attempt.space.prior_sd[own]**2, attempt.space.prior_mean[own])
+            offsets = search.offsets(name, rest, scaled, level=level / 2, formula=None if formula is None else formula[:, :, axis])
+        found += offsets or search.scatters(name, blocks.rough[:, axis], blocks.freedom, level=level / 2)
+    return found
 
 
-def _few_false(p_values):
-    """Return the p-value up to which regimes are reported (Benjamini, Hochberg 1995)."""
-    order = np.sort(p_values)
-    return max(order[order <= FALSE_DISCOVERIES * np.arange(1, len(order) + 1) / max(len(order), 1)], default=-1.0)
+def _scaled(white, scale, columns):
+    return white(columns) / scale
 
 
-def _likeliest_first(regimes):
+def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray, *, seed: int = 0) -> np.ndarray:
     """
-    Return the regimes of an axis in order; among nearly equal likelihoods the first variable precedes.
+    Return random exchanges of the blocks' residuals: each window has the sequence of another of its kind and intensity of motion.
 
-    Scatter is reported only where no offset explains most of it.
+    Exchanged are whole windows, since the residual within a window is correlated; a sequence is repeated or cut to the length of its new
+    window.
+
+    Parameters
+    ----------
+    window : ndarray, shape (b,)
+        Number of the window of each block, in order.
+    kind : ndarray, shape (b,)
+        Kind of that window.
+    intensity : ndarray, shape (b,)
+        Rate of rotation, rad/s.
+    seed : int, optional
+
+    Returns
+    -------
+    ndarray, shape (PERMUTED, b)
+        Block of which each block has the residual.
+
     """
-    if any(regime.offset and regime.share >= MOST_OF_IT for regime in regimes):
-        regimes = [regime for regime in regimes if regime.offset]
-    alike = min((regime.cost for regime in regimes), default=0.0) + ALIKE
-    return sorted(regimes, key=lambda regime: max(regime.cost, alike))
+    rng = np.random.default_rng(seed)
+    _, starts, place, count = np.unique(window, return_index=True, return_inverse=True, return_counts=True)
+    speed = np.sqrt(np.add.reduceat(intensity**2, starts) / count)
+    partner = np.tile(np.arange(len(starts)), (PERMUTED, 1))
+    for each in np.unique(kind):
+        own = np.flatnonzero(kind[starts] == each)
+        own = own[np.argsort(speed[own], kind='stable')]
+        classes = min(INTENSITIES, len(own) // LEAST_ALIKE) if np.ptp(speed[own]) > DEG else 1
+        for part in np.array_split(own, max(classes, 1)):
+            partner[:, part] = rng.permuted(np.tile(part, (PERMUTED, 1)), axis=1)
+    taken = partner[:, place]
+    return starts[taken] + (np.arange(len(window)) - starts[place]) % count[taken]
 
 
-class _AxisRest:
-    """The rest of one axis, its blocks made independent."""
-
-    def __init__(self, blocks, axis, attempt, *, used, white):
-        at = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
-        own = blocks.index[axis][at]
-        self.blocks, self.axis, self._white = blocks, axis, white
-        self.rows = self._of(blocks.design[axis][:, [*at, -1]])
-        self.prior = (1 / attempt.space.prior_sd[own]**2, attempt.space.prior_mean[own])
-        self.training = blocks.window % 2 == 0
-
-    def _of(self, columns):
-        return self._white(columns) / self._white.scale[self.axis]
-
-    def regimes(self, variable):
-        """Yield the regimes of one variable: by offset, and by scatter."""
-        training = self.training
-        found = cleanest(self.rows[training], self._of(variable.marks)[training], self.prior, bins=variable.bins[training],
-                         cyclic=variable.cyclic)
-        for best, offset in reversed(found):
-            chosen = np.isin(variable.bins, best)
-            if not FEWEST <= chosen.sum() <= WIDEST * len(chosen):
-                continue
-            bounds = variable.bounds(best)
-            made = self._with_offset(variable, best, chosen, bounds) if offset else self._with_scatter(variable, best, chosen)
-            if made is not None:
-                yield made
-
-    def _windows(self, chosen):
-        """Return (blocks inside, blocks outside, windows of both) that the range was not found on, or None where they are too few."""
-        inside, outside = ~self.training & chosen, ~self.training & ~chosen
-        windows = [len(np.unique(self.blocks.window[part])) for part in (inside, outside)]
-        return None if windows[0] < 1 or windows[1] < 3 else (inside, outside, windows)
-
-    def _with_offset(self, variable, best, chosen, bounds, tried=1):
-        parts = self._windows(chosen)
-        if parts is None:
-            return None
-        mark, test = self._of(chosen[:, None].astype(float))[:, 0], ~self.training
-        share, p_value = tested_offset(self.rows[test], mark[test], self.prior, n_windows=sum(parts[2]))
-        wide = _wider(self.rows, mark)
-        left = wide @ np.append(-_solved(wide[self.training], _for_one_more(self.prior))[0], 1.0)
-        cost = _cost(float((left[test]**2).sum()), test.sum())
-        return self._regime(variable, best, chosen, share=share, p_value=min(p_value * tried, 1.0), offset=True, cost=cost, bounds=bounds)
-
-    def _with_scatter(self, variable, best, chosen):
-        left = self.rows @ np.append(-_solved(self.rows[self.training & ~chosen], self.prior)[0], 1.0)
-        best = _tightened(best, variable.bins[self.training], left[self.training]**2 - 1.0)
-        chosen = np.isin(variable.bins, best)
-        parts = self._windows(chosen)
-        if parts is None or chosen.sum() < FEWEST:
-            return None
-        share, p_value = _tested_scatter(left, *parts)
-        cost = sum(_cost(float((left[part]**2).sum()), part.sum()) for part in parts[:2])
-        return self._regime(variable, best, chosen, share=share, p_value=p_value, offset=False, cost=cost, bounds=variable.bounds(best))
-
-    def _regime(self, variable, best, chosen, *, share, p_value, offset, cost, bounds):
-        return RestRegime(self.blocks.sensor, AXES[self.axis], variable.name, variable.words(best, bounds) + ', by another offset' * offset,
-                          share, p_value, chosen, self.blocks.time, offset, float(cost), bounds, tuple(best))
-
-    def sharpened(self, variable, regime):
-        """
-        Return a regime of another offset with bounds between blocks: the likeliest of some about the edges of its bins.
-
-        Unless the test windows confirm them the edges are unchanged.
-        """
-        bounds, tried = regime.bounds, 1
-        for end in (0, 1) if bounds and regime.offset else ():
-            options = [(place, bounds[1]) if end == 0 else (bounds[0], place) for place in variable.near(regime.bins, end)]
-            if options:
-                marks = self._of(np.stack([variable.inside(*each) for each in options], axis=1).astype(float))
-                bounds = options[int(np.argmin(_squares_left(self.rows, marks, np.eye(len(options)), self.prior)))]
-                tried *= len(options)
-        other = self._with_offset(variable, regime.bins, variable.inside(*bounds), bounds, 2 * tried) if tried > 1 else None
-        return regime if other is None or other.cost > regime.cost else other
-
-
-def _tightened(best, bins, excess):
-    """Return the shortest part of a range of bins that holds nearly all of the excess in it."""
-    each = np.maximum([excess[bins == number].sum() for number in best], 0.0)
-    sums = np.append(0.0, np.cumsum(each))
-    parts = [(first, last) for first in range(len(best)) for last in range(first + 1, len(best) + 1)
-             if sums[last] - sums[first] >= NEARLY_ALL * sums[-1]]
-    first, last = min(parts, key=lambda part: (part[1] - part[0], sums[part[0]] - sums[part[1]]))
-    return best[first:last]
-
-
-def _tested_scatter(left, inside, outside, windows):
-    """Return (share of the rest that lies inside, p-value of the ratio of variances); degrees of freedom count windows."""
-    energy = [float((left[part]**2).sum()) for part in (inside, outside)]
-    ratio = (energy[0] / inside.sum()) / max(energy[1] / outside.sum(), 1e-300)
-    excess = [max(e - part.sum(), 0.0) for e, part in zip(energy, (inside, outside))]
-    return excess[0] / max(sum(excess), 1e-300), float(f_sf(ratio, *windows))
-
-
-def tested_offset(rows: np.ndarray, mark: np.ndarray, prior: tuple, *, n_windows: int) -> tuple[float, float]:
+class Rest:
     """
-    Return (share of the excess that an offset inside removes, its p-value).
+    The residual of one axis, independent and of unit variance, beside the columns of the model.
 
     Parameters
     ----------
     rows : ndarray, shape (b, q + 1)
-        ``[columns of the model | rest]``, independent and of unit variance.
-    mark : ndarray, shape (b,)
-        The offset's column, made independent as the rows were.
-    prior : (ndarray, ndarray)
-        Prior information and mean of the parameters, shape (q,).
-    n_windows : int
-        Number of degrees of freedom.
+        ``[columns of the model | measured]``.
+    information, mean : ndarray, shape (q,)
+        Prior of the parameters.
 
     """
-    before = _solved(rows, prior)[1]
-    after = _solved(_wider(rows, mark), _for_one_more(prior))[1]
-    dof = max(n_windows - rows.shape[1], 3)
-    ratio = max(before - after, 0.0) / max(after / len(rows), 1.0)
-    return 1.0 - max(after - len(rows), 0.0) / max(before - len(rows), 1e-300), float(f_sf(ratio, 1, dof))
+
+    def __init__(self, rows: np.ndarray, information: np.ndarray, mean: np.ndarray):
+        self.design = rows[:, :-1]
+        self._inverse = np.linalg.inv(self.design.T @ self.design + np.diag(information + TINY))
+        self.values = rows[:, -1] - self.design @ (self._inverse @ (self.design.T @ rows[:, -1] + information * mean))
+
+    def free(self, columns: np.ndarray) -> np.ndarray:
+        """Return columns without the part that the model imitates, shape of the columns."""
+        return columns - self.design @ (self._inverse @ (self.design.T @ columns))
+
+    def offsets(self, marks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (amplitude, residual sum of squares) with each one of some columns in the model, both shape (k,)."""
+        size, product = np.maximum((marks * self.free(marks)).sum(axis=0), TINY), marks.T @ self.values
+        return product / size, self.values @ self.values - product**2 / size
+
+    def energy(self, columns: np.ndarray) -> float:
+        """Return the residual sum of squares with more columns in the model."""
+        norm = np.sqrt((columns**2).sum(axis=0)) + TINY
+        free = self.free(columns / norm)
+        amplitudes = np.linalg.lstsq((columns / norm).T @ free + TINY * np.eye(len(norm)), (columns / norm).T @ self.values, rcond=1e-10)[0]
+        return float(((self.values - free @ amplitudes)**2).sum())
 
 
-def _wider(rows, mark):
-    return np.column_stack([rows[:, :-1], mark, rows[:, -1]])
+@dataclass(frozen=True, eq=False)
+class _Ranges:
+    """The ranges of a variable under test."""
+
+    variable: Variable
+    marks: np.ndarray
+    """Share of each block in each bin, shape (b, k)."""
+    member: np.ndarray
+    """1 in each bin of a range, shape (r, k)."""
 
 
-def _for_one_more(prior):
-    return tuple(np.append(part, 0.0) for part in prior)
-
-
-def _solved(rows, prior):
-    """Return (values, residual sum of squares)."""
-    design = rows[:, :-1]
-    values = np.linalg.solve(design.T @ design + np.diag(prior[0] + TINY), design.T @ rows[:, -1] + prior[0] * prior[1])
-    return values, float(((rows[:, -1] - design @ values)**2).sum())
-
-
-def cleanest(rows: np.ndarray, marks: np.ndarray, prior: tuple, *, bins: np.ndarray, cyclic: bool) -> list[tuple[list[int], bool]]:
+class RegimeSearch:
     """
-    Return ranges of bins in order of likelihood of the residual outside, each with whether it differs by an offset.
+    Search for ranges of variables in which the residual of a sensor has another offset or a larger scatter.
 
-    Either the blocks inside have additional scatter, and the model is fitted outside; or they have a separate offset.
+    Parameters
+    ----------
+    sensor : str
+    time : ndarray, shape (b,)
+        Middle of each block, s.
+    variables : sequence of Variable
+    exchange : ndarray, shape (m, b)
+        See `exchanges`.
+
     """
-    count = marks.shape[1]
-    parts = np.stack([rows[bins == k].T @ rows[bins == k] for k in range(count)])
-    ranges = [[(first + k) % count for k in range(length)] for length in range(1, count) for first in range(count)
-              if cyclic or first + length <= count]
-    member = np.zeros((len(ranges), count))
-    for number, chosen in enumerate(ranges):
-        member[number, chosen] = 1.0
-    n_inside = member @ np.bincount(bins, minlength=count)
-    allowed = (n_inside >= 3) & (n_inside <= WIDEST * len(rows))
-    if not allowed.any():
-        return []
-    ranges, member, n_inside = [r for r, ok in zip(ranges, allowed) if ok], member[allowed], n_inside[allowed]
-    inside = np.einsum('rk,kij->rij', member, parts)
-    energy = _energies(inside, parts.sum(axis=0) - inside, prior)
-    scatter = sum(_cost(e, n) for e, n in zip(energy, (n_inside, len(rows) - n_inside)))
-    offset = _cost(_squares_left(rows, marks, member, prior), len(rows))
-    return [(ranges[int(np.argmin(cost))], by_offset) for cost, by_offset in ((scatter, False), (offset, True))]
+
+    def __init__(self, sensor: str, time: np.ndarray, variables: Sequence[Variable], exchange: np.ndarray):
+        self.sensor, self.time, self._exchange, self._ranges = sensor, time, exchange, []
+        for variable in variables:
+            marks, member = variable.marks, variable.ranges
+            inside = member @ marks.sum(axis=0)
+            allowed = (inside >= min(FEWEST, len(marks) / 8)) & (inside <= WIDEST * len(marks))
+            if allowed.any():
+                self._ranges.append(_Ranges(variable, marks, member[allowed]))
+
+    def offsets(self, axis: str, rest: Rest, white: Callable, *, level: float, formula: np.ndarray | None = None) -> list[RestRegime]:
+        """
+        Return the ranges with another offset, the likeliest first, without those that a smooth curve or a formula describes as well.
+
+        The statistic is the largest share of the squares that one offset explains.
+
+        Parameters
+        ----------
+        axis : str
+        rest : Rest
+        white : callable
+            Makes columns over the blocks independent and of unit variance, as the rows of `rest`.
+        level : float
+            Largest probability of a regime by chance.
+        formula : ndarray, shape (b, k), optional
+            Columns of a formula for the residual.
+
+        """
+        exchanged = np.column_stack([rest.values, rest.free(rest.values[self._exchange].T)])
+        energy, shares = (exchanged**2).sum(axis=0), []
+        for each in self._ranges:
+            marks = white(each.marks)
+            size = np.einsum('rk,kl,rl->r', each.member, marks.T @ rest.free(marks), each.member)
+            shares.append((each.member @ (marks.T @ exchanged))**2 / np.maximum(size, TINY)[:, None] / energy)
+        p_value, likely = self._tested(shares)
+        if p_value > level:
+            return []
+        curves = [each.variable.curves for each in self._ranges if len(each.variable.edges)] + ([] if formula is None else [formula])
+        limit = _cost(min([energy[0], *(rest.energy(white(columns)) for columns in curves)]), len(self.time)) - SURE
+        found = []
+        for each, number in likely:
+            mark, bounds, words, size, after = self._refined(rest, white, each, number)
+            share = 1.0 - max(after - len(mark), 0.0) / max(energy[0] - len(mark), TINY)
+            if share >= MOST_OF_IT and _cost(after, len(mark)) < limit:
+                found.append(RestRegime(self.sensor, axis, each.variable.name, words + ', by another offset', float(share), p_value,
+                                        float(size), mark > 0.5, self.time, True, bounds))
+        return _largest_share_first(found)
+
+    def _refined(self, rest, white, each, number):
+        """Return (share of each block inside, bounds, words, offset, residual sum of squares) of a range with its best bounds between rows."""
+        variable, chosen = each.variable, each.variable.chosen(each.member[number])
+        bounds, mark = variable.bounds(chosen), each.marks[:, chosen].sum(axis=1)
+        for end in (0, 1) if bounds else ():
+            options = [(place, bounds[1]) if end == 0 else (bounds[0], place) for place in variable.near(chosen, end)]
+            if options:
+                tried = np.stack([variable.inside(*option) for option in options], axis=1)
+                best = int(np.argmin(rest.offsets(white(tried))[1]))
+                bounds, mark = options[best], tried[:, best]
+        (size,), (after,) = rest.offsets(white(mark[:, None]))
+        return mark, bounds, variable.words(chosen, bounds), size, after
+
+    def scatters(self, axis: str, rough: np.ndarray, weight: np.ndarray, *, level: float) -> list[RestRegime]:
+        """
+        Return the ranges with a larger variance within blocks, the likeliest first; arguments as `offsets`, and:
+
+        The statistic is the largest fall of minus twice the log likelihood by a separate variance in a range.
+
+        Parameters
+        ----------
+        axis : str
+        rough : ndarray, shape (b,)
+            Variance within the blocks.
+        weight : ndarray, shape (b,)
+            Its degrees of freedom.
+        level : float
+            Largest probability of a regime by chance.
+
+        """
+        usual = float(np.median(rough))
+        if usual <= 0 or not any(gain.any() for gain in self._falls(rough[:, None] / usual, weight)):
+            return []
+        rough = rough / usual
+        p_value, likely = self._tested(self._falls(np.column_stack([rough, rough[self._exchange].T]), weight))
+        if p_value > level:
+            return []
+        smooth = [_smooth_scatter(each.variable.curves, rough, weight) for each in self._ranges if len(each.variable.edges)]
+        (limit, dispersion), found = min(smooth, default=(_cost(weight @ rough, weight.sum()), 1.0)), []
+        for each, number in likely:
+            variable = each.variable
+            chosen = _tightened(variable.chosen(each.member[number]), np.maximum(each.marks.T @ (weight * (rough - 1.0)), 0.0))
+            mark = each.marks[:, chosen].sum(axis=1)
+            energy, count = (np.array([(mark * part).sum(), ((1.0 - mark) * part).sum()]) for part in (weight * rough, weight))
+            excess, means = np.maximum(energy - count, 0.0), energy / np.maximum(count, 1.0)
+            share = excess[0] / max(excess.sum(), TINY)
+            if share >= MOST_OF_IT and _cost(energy, count).sum() < limit - SURE * dispersion:
+                bounds = variable.bounds(chosen)
+                found.append(RestRegime(self.sensor, axis, variable.name, variable.words(chosen, bounds) + ', by larger scatter',
+                                        float(share), p_value, float(np.sqrt(usual * max(means[0] - means[1], 0.0))), mark > 0.5,
+                                        self.time, False, bounds))
+        return _largest_share_first(found)
+
+    def _falls(self, rough, weight):
+        """Return for each variable the fall of the cost by a separate variance in each range, zero where it is hardly larger, shape (r, m)."""
+        squares, count, gains = rough * weight[:, None], weight.sum(), []
+        energy = squares.sum(axis=0)
+        for each in self._ranges:
+            inside, within = (each.member @ (each.marks.T @ weight))[:, None], each.member @ (each.marks.T @ squares)
+            louder = within * (count - inside) > LOUDER * np.maximum(energy - within, count - inside) * inside
+            row, column = np.nonzero(louder)
+            own, part, whole = inside[row, 0], within[louder], energy[column]
+            gains.append(np.zeros(within.shape))
+            gains[-1][louder] = _cost(whole, count) - _cost(part, own) - _cost(whole - part, count - own)
+        return gains
+
+    def _tested(self, gains):
+        """Return (p-value of the largest gain, shape of each (r, 1 + m), the likeliest ranges as (_Ranges, number), in order of variables)."""
+        if not gains:
+            return 1.0, []
+        largest = np.max([each.max(axis=0) for each in gains], axis=0)
+        order = np.argsort([-each[:, 0].max() for each in gains], kind='stable')[:REPORTED]
+        return float((largest >= largest[0]).mean()), [(self._ranges[k], int(np.argmax(gains[k][:, 0]))) for k in sorted(order)]
 
 
-def _energies(inside, outside, prior):
-    """Return the sums of squares inside and outside under the model fitted outside, each (r,)."""
-    right = (outside[:, :-1, -1] + prior[0] * prior[1])[..., None]
-    values = np.linalg.solve(outside[:, :-1, :-1] + np.diag(prior[0] + TINY), right)[..., 0]
-    weights = np.concatenate([-values, np.ones((len(values), 1))], axis=1)
-    return [np.einsum('ri,rij,rj->r', weights, part, weights) for part in (inside, outside)]
+def _largest_share_first(found):
+    """Return regimes in order of their shares; among nearly equal ones the order is kept."""
+    alike = max((regime.share for regime in found), default=0.0) - ALIKE
+    return sorted(found, key=lambda regime: -min(regime.share, alike))
 
 
-def _squares_left(rows, marks, member, prior):
-    """Return the residual sum of squares of the model with a separate offset for each range, shape (r,)."""
-    design = rows[:, :-1]
-    values, left = _solved(rows, prior)
-    inverse = np.linalg.inv(design.T @ design + np.diag(prior[0] + TINY))
-    free = marks - design @ (inverse @ (design.T @ marks))
-    rest = rows[:, -1] - design @ values
-    size = np.einsum('rk,kl,rl->r', member, free.T @ marks, member)
-    return left - (member @ (free.T @ rest))**2 / np.maximum(size, 1e-9)
+def _tightened(chosen, excess):
+    """Return the shortest part of a range of bins that holds nearly all of the excess in it."""
+    sums = np.append(0.0, np.cumsum(excess[chosen]))
+    parts = [(first, last) for first in range(len(chosen)) for last in range(first + 1, len(chosen) + 1)
+             if sums[last] - sums[first] >= NEARLY_ALL * sums[-1]]
+    first, last = min(parts, key=lambda part: (part[1] - part[0], sums[part[0]] - sums[part[1]]))
+    return chosen[first:last]
 
 
 def _cost(energy, count):
-    variance = np.maximum(energy / np.maximum(count, 1), 1.0)
+    """Return minus twice the log likelihood of residuals with one variance, at least that of noise."""
+    variance = np.maximum(energy / np.maximum(count, 1.0), 1.0)
     return count * np.log(variance) + energy / variance
+
+
+def _smooth_scatter(columns, variance, weight):
+    """
+    Return (minus twice the log likelihood, dispersion) of variances that are exp(a combination of columns), by Fisher scoring.
+
+    The dispersion is 1 where the variances scatter about the curve as those of Gaussian noise with `weight` degrees of freedom.
+    """
+    design, root = np.column_stack([np.ones(len(columns)), columns]), np.sqrt(weight)
+    values = np.zeros(design.shape[1])
+    for _ in range(SCORINGS):
+        ratio = np.minimum(variance * np.exp(-np.maximum(design @ values, 0.0)), LARGEST)
+        values = values + np.linalg.lstsq(root[:, None] * design, root * (ratio - 1.0), rcond=1e-9)[0]
+    logs = np.maximum(design @ values, 0.0)
+    ratio = variance * np.exp(-logs)
+    return float((weight * (logs + ratio)).sum()), max(float((weight * (ratio - 1.0)**2).mean()) / 2, 1.0)

@@ -14,7 +14,7 @@ from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.investigation import Investigation, investigate
 from imu_calibration.selection.proposals import Proposal, propose
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.regimes import MOST_OF_IT, RestRegime, find_regimes
+from imu_calibration.selection.regimes import RestRegime, find_regimes
 from imu_calibration.selection.residual_blocks import RestBlocks, rest_blocks
 from imu_calibration.selection.residual_fit import BlockFits
 from imu_calibration.selection.unexplained import Unexplained, unexplained
@@ -57,10 +57,11 @@ class Examination(Investigation):
             self._fits[sensor, used] = BlockFits(self.blocks[sensor], used, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
         return self._fits[sensor, used]
 
-    def regimes(self, sensor: str, chosen: Sequence[Question] | None = None) -> list[RestRegime]:
-        """Return the regimes of a sensor's residual with a choice in the model; default: the findings (`find_regimes`)."""
-        return find_regimes(self.blocks[sensor], self.attempt, self.search.used(self.named if chosen is None else chosen),
-                            joint_names=self.table.joint_names)
+    def regimes(self, sensor: str, chosen: Sequence[Question] | None = None, formula: np.ndarray | None = None) -> list[RestRegime]:
+        """Return the regimes of a sensor's residual with a choice in the model, the findings where not given (`find_regimes`)."""
+        fits, offsets = self.fits(sensor, chosen), chosen is not None or self.rests[sensor].significant or formula is not None
+        return find_regimes(self.blocks[sensor], self.attempt, sorted(fits.used), joint_names=self.table.joint_names,
+                            axes=fits.axes() if offsets else (), formula=formula)
 
     def proposal(self, sensor: str) -> Proposal | None:
         """
@@ -73,6 +74,16 @@ class Examination(Investigation):
             clear = self.rests[sensor].significant or fits.sigma > CLEAR
             self._proposals[sensor] = propose(self.blocks[sensor], self.attempt, fits) if clear else None
         return self._proposals[sensor]
+
+    def columns(self, sensor: str, proposal: Proposal | None) -> np.ndarray | None:
+        """Return the columns of the formulas of a proposal over the blocks of a sensor, shape (b, k, 3), or None without one."""
+        if proposal is None:
+            return None
+        blocks = self.blocks[sensor]
+        groups = [group for effect in proposal.effects for group in effect.groups]
+        known = {'temperature_ref_c': self.attempt.recording.model.temperature_ref_c}
+        means = [blocks.means(group.columns(blocks.ref, known)) for group in groups]
+        return np.stack([np.broadcast_to(mean, (len(mean), 3)) for mean in means], axis=1)
 
     def free(self) -> None:
         """Free the blocks and their fits; they are computed again on demand."""
@@ -137,8 +148,8 @@ def _done_without(found, question):
     others = [other for other in found.named if other is not question]
     kept, left_out = ({sensor: found.fits(sensor, some) for sensor in sensors} for some in (found.named, others))
     alone = {sensor: left_out[sensor].fit().excess - kept[sensor].fit().excess for sensor in sensors}
-    for stand_in in (lambda sensor: _columns(found, sensor, found.proposal(sensor)),
-                     lambda sensor: _columns(found, sensor, propose(found.blocks[sensor], found.attempt, left_out[sensor])),
+    for stand_in in (lambda sensor: found.columns(sensor, found.proposal(sensor)),
+                     lambda sensor: found.columns(sensor, propose(found.blocks[sensor], found.attempt, left_out[sensor])),
                      lambda sensor: _places(found, sensor, others)):
         beside = dict(alone)
         for sensor in asked:
@@ -150,20 +161,9 @@ def _done_without(found, question):
     return False
 
 
-def _columns(found, sensor, proposal):
-    """Return the columns of the formulas of a proposal over the blocks of a sensor, shape (b, k, 3), or None without one."""
-    if proposal is None:
-        return None
-    blocks = found.blocks[sensor]
-    groups = [group for effect in proposal.effects for group in effect.groups]
-    known = {'temperature_ref_c': found.attempt.recording.model.temperature_ref_c}
-    means = [blocks.means(group.columns(blocks.ref, known)) for group in groups]
-    return np.stack([np.broadcast_to(mean, (len(mean), 3)) for mean in means], axis=1)
-
-
 def _places(found, sensor, chosen):
     """Return an indicator column of the regimes where an offset explains most of an axis' residual, shape (b, 1, 3), or None."""
-    offsets = [regime for regime in found.regimes(sensor, chosen) if regime.offset and regime.share >= MOST_OF_IT]
+    offsets = [regime for regime in found.regimes(sensor, chosen) if regime.offset]
     first = {regime.axis: regime.inside for regime in reversed(offsets)}
     nowhere = np.zeros(len(found.blocks[sensor].time))
     return np.stack([first.get(axis, nowhere) for axis in AXES], axis=1)[:, None].astype(float) if first else None

@@ -26,6 +26,8 @@ MOST_BLOCKS = 1200
 """Blocks of one recording, about: their full covariance is factored."""
 AT_A_TIME = 256
 """Blocks whose columns are in memory at once."""
+WHITE_BENDS, PER_FREEDOM = 6.0, 35 / 18
+"""Variance of second differences of unit white noise, and their number for each degree of freedom of a mean of their squares."""
 WITHIN = 5
 """Rows at which the columns of a block are evaluated."""
 
@@ -54,6 +56,10 @@ class RestBlocks:
     """Variance of a block's residual by the white noise, shape (b, 3)."""
     processes: tuple
     """How every bias moves (BiasProcess)."""
+    rough: np.ndarray
+    """Variance of the residual within a block by second differences, which suppress causes that vary with the motion, shape (b, 3)."""
+    freedom: np.ndarray
+    """Its degrees of freedom, shape (b,)."""
 
     @property
     def warms(self) -> bool:
@@ -62,7 +68,7 @@ class RestBlocks:
 
     def means(self, rows: np.ndarray) -> np.ndarray:
         """Return means over the blocks of something known at the rows, shape (b, ...)."""
-        return _means(rows, self.starts)
+        return block_means(rows, self.starts)
 
     def whitener(self, select: np.ndarray) -> 'BlockWhitener':
         """Return the whitener of the blocks `select` (mask): independent, of unit variance."""
@@ -128,8 +134,18 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
         rows = np.concatenate([columns_of[sensor], mean], axis=1)
         design = tuple(rows @ join for join in attempt.space.join[sensor])
         found[sensor] = RestBlocks(sensor, references.at(sensor), **common, design=design, index=tuple(attempt.space.index[sensor]),
-                                   variance=variance, processes=processes)
+                                   variance=variance, processes=processes, **_roughness(residual, windows, edges, least=LEAST_NOISE[sensor]))
     return found
+
+
+def _roughness(residual, windows, edges, least):
+    """Return the variance by second differences within blocks that begin at the samples `edges`, at least that of rounding, and its freedom."""
+    inner, ends = np.ones(len(residual)), np.cumsum([len(window) for window in windows])
+    inner[ends - 1] = inner[np.append(0, ends[:-1])] = 0.0
+    bends = np.diff(residual, 2, axis=0, prepend=residual[:1], append=residual[-1:])
+    number = np.add.reduceat(inner, edges)
+    squares = np.add.reduceat(inner[:, None] * bends**2, edges, axis=0) / WHITE_BENDS
+    return {'rough': np.maximum(squares / np.maximum(number, 1)[:, None], least**2), 'freedom': number / PER_FREEDOM}
 
 
 def _some(windows, length):
@@ -176,11 +192,11 @@ def _block_means(attempt, table, motion, temperature, starts):
         for sensor in SENSORS:
             taken = [columns(recording.model, sensor, table, motion=references.motion, temperature_c=warmth, references=references),
                      *(entry.columns(references.at(sensor)) for entry in recording.bank[sensor])]
-            found[sensor].append(_means(np.concatenate(taken, axis=1), own[:-1] - own[0]))
+            found[sensor].append(block_means(np.concatenate(taken, axis=1), own[:-1] - own[0]))
     return {sensor: np.concatenate(parts) for sensor, parts in found.items()}
 
 
-def _means(rows, starts):
+def block_means(rows: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """Return means over the blocks that begin at `starts`, shape (b, ...)."""
     counts = np.diff(np.append(starts, len(rows)))
     return np.add.reduceat(rows, starts, axis=0) / counts.reshape(-1, *[1] * (rows.ndim - 1))

@@ -15,11 +15,13 @@ def look_beyond(found: Examination) -> dict[str, Unexplained]:
     looked = {sensor: replace(rest, tones=tones[sensor]) for sensor, rest in found.rests.items()}
     for sensor, rest in looked.items():
         proposal = found.proposal(sensor)
-        if rest.significant or proposal is not None:
-            regimes, axes = found.regimes(sensor), rest.axes or found.fits(sensor).axes()
-            first = [next((regime for regime in regimes if regime.axis == axis), None) for axis in axes]
-            looked[sensor] = replace(rest, regimes=tuple(regime for regime in first if regime is not None), proposal=proposal,
+        regimes = found.regimes(sensor, formula=found.columns(sensor, proposal))
+        first = {regime.axis: regime for regime in reversed(regimes)}
+        if rest.significant or proposal is not None or first:
+            axes = rest.axes or (found.fits(sensor).axes() if proposal is not None else tuple(first))
+            looked[sensor] = replace(rest, regimes=tuple(first[axis] for axis in axes if axis in first), proposal=proposal,
                                      axes=axes if proposal is None else proposal.axes)
-        if proposal is not None and not rest.significant:
-            looked[sensor] = replace(looked[sensor], significant=True, rms=float(np.hypot.reduce(proposal.sizes)))
+        if (proposal is not None or first) and not rest.significant:
+            sizes = proposal.sizes if proposal is not None else [regime.size * np.sqrt(regime.inside.mean()) for regime in first.values()]
+            looked[sensor] = replace(looked[sensor], significant=True, rms=float(np.hypot.reduce(sizes)))
     return looked

@@ -79,7 +79,8 @@ def find_tones(found: Investigation, table: Table) -> dict[str, tuple[Tone, ...]
     The residual of every stretch of at most ten seconds, or of at most ten turns of a joint in steady rotation, is transformed to
     frequencies. A peak has four times the median power around it; a tone has peaks in most stretches, tested against noise
     (binomial law). Rests and motions are both analysed in seconds; a tone at a multiple of a speed is constant per turn and varies per
-    second. Where few stretches turn, integer orders are searched in all motions of the joint (`selection.orders`).
+    second. Where few stretches turn, integer orders are searched in all motions of the joint (`selection.orders`). Fixed frequencies are
+    removed before multiples of a speed are searched.
     """
     attempt = found.attempt
     values = attempt.values(found.named)[:len(attempt.recording.model.param_names)]
@@ -88,15 +89,31 @@ def find_tones(found: Investigation, table: Table) -> dict[str, tuple[Tone, ...]
     tones = {}
     for sensor in SENSORS:
         parts = np.split(left[sensor], edges)
-        asked = [(None, None), *enumerate(table.joint_names)]
-        every = (tone for joint, name in asked for tone in (*of_stretches(sensor, _stretches(found.used, parts, joint), name),
-                                                            *_whole(sensor, found.used, parts, joint, name)))
-        told = [replace(tone, p_value=tone.p_value * len(AXES) * len(asked)) for tone in every]
-        first = {}
-        for tone in sorted((tone for tone in told if tone.p_value < SIGNIFICANT), key=lambda tone: tone.p_value):
-            first.setdefault((tone.axis, tone.joint), tone)
-        tones[sensor] = tuple(first.values())
+        fixed = _significant(of_stretches(sensor, _stretches(found.used, parts, None), None), 1 + len(table.joint_names))
+        for tone in fixed.values():   # sampled at equal angles, a fixed frequency would be a multiple of some speeds
+            for window, part in zip(found.used, parts):
+                part[:, AXES.index(tone.axis)] = _without(tone.frequency, window.time, part[:, AXES.index(tone.axis)])
+        turning = (tone for joint, name in enumerate(table.joint_names)
+                   for tone in (*of_stretches(sensor, _stretches(found.used, parts, joint), name),
+                                *_whole(sensor, found.used, parts, joint, name)))
+        every = fixed | _significant(turning, 1 + len(table.joint_names))
+        tones[sensor] = tuple(sorted(every.values(), key=lambda tone: tone.p_value))
     return tones
+
+
+def _significant(tones, tests):
+    """Return (axis, joint) -> the most significant tone, its p-value times the number of tests and axes."""
+    told, first = [replace(tone, p_value=tone.p_value * len(AXES) * tests) for tone in tones], {}
+    for tone in sorted((tone for tone in told if tone.p_value < SIGNIFICANT), key=lambda tone: tone.p_value):
+        first.setdefault((tone.axis, tone.joint), tone)
+    return first
+
+
+def _without(frequency, time, values):
+    """Return values without the waves about a frequency, to the resolution of their duration."""
+    waves = np.exp(2j * np.pi * np.outer(time - time[0], frequency + 0.5 * np.arange(-2, 3) / np.ptp(time)))
+    basis = np.linalg.qr(np.column_stack([waves.real, waves.imag]))[0]
+    return values - basis @ (basis.T @ values)
 
 
 def _whole(sensor, windows, parts, joint, name) -> Iterator[Tone]:

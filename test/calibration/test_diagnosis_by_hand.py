@@ -19,6 +19,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.model_selection import Inquiry, investigate_by_hand
+from imu_calibration.selection import regimes
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import random_values
 from imu_calibration.simulation.session import simulate as simulate_session
@@ -99,8 +100,9 @@ def test_what_held_parameters_may_be_is_no_finding(monkeypatch):
 
 
 def test_a_place_among_few_poses_is_paid_for(monkeypatch):
-    """Any range of noise is the likeliest of many: its chance counts them all."""
-    monkeypatch.setattr(hand_diagnosis, 'MOST_OF_IT', 0.0)
+    """Any range of noise is the likeliest of many: its chance counts them all; one of 20 recordings is expected."""
+    monkeypatch.setattr(regimes, 'MOST_OF_IT', 0.0)
+    monkeypatch.setattr(regimes, 'SURE', 0.0)
     poses = SimpleNamespace(time=10.0 * np.arange(24), temperature_c=None)
     rng = np.random.default_rng(21501)
     told = []
@@ -109,7 +111,7 @@ def test_a_place_among_few_poses_is_paid_for(monkeypatch):
         hand = SimpleNamespace(gravity=GRAVITY, state=SimpleNamespace(up=up / np.linalg.norm(up, axis=1, keepdims=True)), poses=poses)
         block = SimpleNamespace(sensor='gyroscope', floor=np.ones((24, 3)), pose=np.arange(24), time=poses.time)
         told += hand_diagnosis.regimes_by_hand(hand, block, rng.normal(size=(24, 3)))
-    assert len(told) <= 1
+    assert len(told) <= 2
 
 
 def test_sizes_agree_with_what_was_hidden(responding):

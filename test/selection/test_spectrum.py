@@ -5,7 +5,7 @@ import pytest
 
 from imu_calibration.report.spectrum_figure import draw_tones
 from imu_calibration.selection.investigation import investigate
-from imu_calibration.selection.spectrum import find_tones, of_stretches
+from imu_calibration.selection.spectrum import _without, find_tones, of_stretches
 
 from worlds.hiding import record
 from worlds.physics_beyond import Machine
@@ -36,6 +36,13 @@ def test_noise_that_is_not_white_is_no_tone():
     rng = np.random.default_rng(1)
     walks = [(np.cumsum(rng.normal(size=(600, 3)), axis=0), STEP, 45.0) for _ in range(40)]
     assert not list(of_stretches('gyroscope', walks, None))
+
+
+def test_a_fixed_frequency_is_removed_before_orders_are_searched():
+    time, rng = STEP * np.arange(700), np.random.default_rng(2)
+    other, line = np.sin(2 * np.pi * 11.0 * time) + 0.1 * rng.normal(size=len(time)), np.sin(2 * np.pi * 31.04 * time + 1.0)
+    left = _without(31.0, time, other + 3.0 * line)
+    assert np.std(left - other) < 0.05 and abs(left @ line) / len(time) < 1e-3
 
 
 def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():

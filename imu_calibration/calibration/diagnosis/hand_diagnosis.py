@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,14 +20,10 @@ from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.model_selection import HandInvestigation, investigate_by_hand
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regime_variables import Variable, ranged
-from imu_calibration.selection.regimes import RestRegime, cleanest, tested_offset
+from imu_calibration.selection.regimes import BY_CHANCE, Rest, RestRegime, RegimeSearch, exchanges
 from imu_calibration.selection.residual_fit import LEAST_OF_AXIS
 from imu_calibration.selection.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations, where_most
 
-BY_CHANCE = 0.01
-"""Significance level of a regime, for all ranges of all variables."""
-MOST_OF_IT = 0.8
-"""Least share of an axis' residual that an offset there explains."""
 NORM = 'norm'
 """Without a table only the component of the accelerometer's error along gravity is observable."""
 
@@ -35,8 +32,7 @@ def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -
     """
     Return the clearest regime of each axis.
 
-    Poses are too few for separate selection and test: the p-value of the likeliest range is multiplied by the number of ranges. Regimes
-    of larger scatter are not reported, since every other range of few poses has it.
+    Regimes of larger scatter are not reported, since every other range of few poses has it.
 
     Parameters
     ----------
@@ -48,42 +44,28 @@ def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -
         Residual of each pose, by a fit without it.
 
     """
-    variables = _variables(hand, block)
     names = AXES if residual.shape[1] == len(AXES) else (NORM,)
-    found = []
+    poses = np.arange(len(residual))
+    exchange = exchanges(poses, np.zeros(len(poses)), np.zeros(len(poses)))
+    search, found = RegimeSearch(block.sensor, block.time, _variables(hand, block), exchange), []
     for axis, name in enumerate(names):
         sd = np.sqrt(block.floor[:, axis])
-        rows = np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None]
-        regimes = [regime for variable in variables if (regime := _of_variable(block, name, rows, sd, variable)) is not None]
-        number = len(names) * sum(variable.marks.shape[1]**2 // 2 for variable in variables)
-        sure = [regime for regime in regimes if regime.p_value * number < BY_CHANCE and regime.share >= MOST_OF_IT]
-        found += sorted(sure, key=lambda regime: regime.cost)[:1]
+        rest = Rest(np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None], np.zeros(1), np.zeros(1))
+        found += search.offsets(name, rest, partial(np.multiply, 1.0 / sd[:, None]), level=BY_CHANCE / len(names))[:1]
     return tuple(found)
-
-
-def _of_variable(block, axis, rows, sd, variable):
-    """Return the range of a variable in which an offset explains most, or None where it has too few values."""
-    prior, marks = (np.zeros(1), np.zeros(1)), variable.marks / sd[:, None]
-    best = next((chosen for chosen, offset in cleanest(rows, marks, prior, bins=variable.bins, cyclic=variable.cyclic) if offset), None)
-    if best is None:
-        return None
-    mark = marks[:, best].sum(axis=1)
-    share, p_value = tested_offset(rows, mark, prior, n_windows=len(rows))
-    bounds = variable.bounds(best)
-    return RestRegime(block.sensor, axis, variable.name, variable.words(best, bounds) + ', by another offset', share, p_value,
-                      np.isin(variable.bins, best), block.time, True, p_value, bounds)
 
 
 def _variables(hand: HandCalibration, block: Block) -> list[Variable]:
     """Return the variables of regimes of poses: the attitude, the previous attitude, the time and the temperature."""
     force = hand.gravity * hand.state.up
     before = np.concatenate([force[:1], force[:-1]])
-    found = ranged('time', block.time, 's')
+    of = partial(ranged, starts=np.arange(len(block.time)))
+    found = of('time', block.time, 's')
     for k, axis in enumerate(AXES):
-        found += ranged(f'specific force along {axis}', force[block.pose, k], 'm/s^2', least=0.5)
-        found += ranged(f'specific force along {axis} in the pose before', before[block.pose, k], 'm/s^2', least=0.5)
+        found += of(f'specific force along {axis}', force[block.pose, k], 'm/s^2', least=0.5)
+        found += of(f'specific force along {axis} in the pose before', before[block.pose, k], 'm/s^2', least=0.5)
     warm = hand.poses.temperature_c
-    return found if warm is None else found + ranged('temperature', warm[block.pose], 'C', least=0.5)
+    return found if warm is None else found + of('temperature', warm[block.pose], 'C', least=0.5)
 
 
 PER_TURN = 'rad/turn'
