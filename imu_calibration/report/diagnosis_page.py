@@ -81,7 +81,7 @@ def _reasons(diagnosis, rests):
                           f'{" and ".join(rest.proposal.columns)}.', f'to confirm the formula: {rest.proposal.motion}'))
             continue
         more = f', correlated with {rest.correlates_with}' if rest.correlates_with else ''
-        lines.append((f'{rms} rms of the {sensor} residual are unexplained{more}' + (f'; {rest.where}' if rest.where else '') + '.',
+        lines.append((f'{rms} rms of the {sensor} residual are unexplained{more}' + '.',
                       'check the mount and the joints for a knock or slip, and causes outside the catalogue'))
     return lines
 
@@ -273,4 +273,4 @@ def _goes_with(rest):
 
 def _rest(sensor, rest):
     return {'sensor': sensor, 'significant': rest.significant, 'rms': in_unit(rest.rms, rest.unit or UNIT[sensor]),
-            'sigma': text(rest.sigma, 2), 'with': _goes_with(rest), 'where': rest.where or '–'}
+            'sigma': text(rest.sigma, 2), 'with': _goes_with(rest)}

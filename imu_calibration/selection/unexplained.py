@@ -37,8 +37,6 @@ class Unexplained:
     """Variable of the largest correlation, or None."""
     share: float
     """Share of the windows' variance explained by it."""
-    where: str | None
-    """Where in the session most of it sits."""
     residual: np.ndarray
     """Residual of the windows' means, shape (k, 3)."""
     noise_sd: np.ndarray
@@ -91,14 +89,14 @@ def _rest(attempt, explained, sensor, excess, values):
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
     significant = bool(sigma > SIGNIFICANT and explained.n_means >= 3 * LEAST_WINDOWS)
     if not significant:
-        return Unexplained(False, rms, float(sigma), None, 0.0, None, residual, noise_sd)
+        return Unexplained(False, rms, float(sigma), None, 0.0, residual, noise_sd)
     if sigma_means <= SIGNIFICANT:
         inside = np.mean([floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])])
-        return Unexplained(True, float(np.sqrt(inside * within / explained.n_within)), float(sigma), None, 0.0, None, residual, noise_sd)
+        return Unexplained(True, float(np.sqrt(inside * within / explained.n_within)), float(sigma), None, 0.0, residual, noise_sd)
     if rms == 0:   # less than biases may wander, and more than neighbours may differ
         rms = float(np.sqrt(np.mean(white) * means / explained.n_means))
     name, share = correlate(_explanations(recording), residual / noise_sd)
-    return Unexplained(True, rms, float(sigma), name, share, where_most(recording.time, residual, noise_sd), residual, noise_sd)
+    return Unexplained(True, rms, float(sigma), name, share, residual, noise_sd)
 
 
 def correlate(explanations: Iterator, residual: np.ndarray) -> tuple[str | None, float]:
@@ -152,21 +150,3 @@ def slow_explanations(time: np.ndarray, temperature: np.ndarray) -> Iterator[tup
 
 def _step(time):
     return np.stack([time > level for level in np.quantile(time, (0.2, 0.35, 0.5, 0.65, 0.8))], axis=1).astype(float)
-
-
-def where_most(time: np.ndarray, residual: np.ndarray, noise_sd: np.ndarray) -> str | None:
-    """Return a sentence about the shortest stretch that holds four fifths of the rest, or None when it is everywhere."""
-    order = np.argsort(time)
-    weight = np.maximum(((residual / noise_sd)**2 - 1).sum(axis=1)[order], 0.0)
-    sums = np.concatenate([[0.0], np.cumsum(weight)])
-    if sums[-1] <= 0:
-        return None
-    stop = np.searchsorted(sums, sums[:-1] + 0.8 * sums[-1])
-    time = time[order]
-    known = np.flatnonzero(stop <= len(time))
-    lengths = time[np.minimum(stop[known] - 1, len(time) - 1)] - time[known]
-    first = known[int(np.argmin(lengths))]
-    if lengths.min() > 0.6 * np.ptp(time):
-        return None
-    start, end = f'{time[first]:.0f}', f'{time[stop[first] - 1]:.0f}'
-    return f'four fifths of it lie between {start} s and {end} s' if start != end else f'four fifths of it lie in one window at {start} s'

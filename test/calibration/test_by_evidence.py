@@ -235,7 +235,7 @@ def test_what_a_rest_may_move_biases_by():
     """Of the axes that carry it, by the scatter of the means beyond noise; of a rest that is none, nothing."""
     model, noise = SensorModel(), np.full((400, 3), 3.0)
     residual = np.outer(np.where(np.arange(400) % 2, 5.0, -5.0), [1.0, 1.0, 0.1])
-    rest = Unexplained(True, 4.0, 9.0, None, 0.0, None, residual, noise, axes=('y',))
+    rest = Unexplained(True, 4.0, 9.0, None, 0.0, residual, noise, axes=('y',))
     assert biases_off(model, {'gyroscope': rest, 'accelerometer': replace(rest, significant=False)}) == [{'gyroscope.bias.y': pytest.approx(4.0)}]
     assert biases_off(model, {'gyroscope': replace(rest, axes=('z',))}) == [{'gyroscope.bias.z': 0.0}]
 

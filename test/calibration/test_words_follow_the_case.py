@@ -1,6 +1,5 @@
 """Advice and explanations speak of the case at hand."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,6 @@ from imu_calibration.document.comparison import compare
 from imu_calibration.estimation.pieces import Regime
 from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT, motions_about
 from imu_calibration.kinematics.table import Table
-from imu_calibration.selection.unexplained import where_most
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.compensate import compensate
 
@@ -59,14 +57,6 @@ def test_compare_says_that_off_diagonal_terms_include_the_mounting():
     on_table, without = (compare(*pair).lines for pair in pairs)
     assert len(on_table) == len(without) + 1 and sum('mounted' in line for line in on_table) == 1
     assert len(compare(first, first).lines) < len(without)
-
-
-def test_a_rest_in_one_window_does_not_lie_between_two_equal_times():
-    time, residual = np.arange(10) * 20.0, np.full((10, 3), 1.0)
-    residual[4] = 50.0
-    assert re.findall(r'\d+ s', where_most(time, residual, np.ones(3))) == ['80 s']
-    residual[7] = 50.0
-    assert re.findall(r'\d+ s', where_most(time, residual, np.ones(3))) == ['80 s', '140 s']
 
 
 def test_a_ros_1_bag_is_told_how_to_be_converted(tmp_path):

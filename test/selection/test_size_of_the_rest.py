@@ -11,7 +11,6 @@ def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monk
     """Plain squares of the means are less than noise and wander allow; whitened ones are not: "0 deg/s, significant" was told."""
     monkeypatch.setattr(unexplained, 'correlate', lambda explanations, residual: ('time', 0.5))
     monkeypatch.setattr(unexplained, '_explanations', lambda recording: {})
-    monkeypatch.setattr(unexplained, 'where_most', lambda *arguments: None)
     n = 40
     noise = SimpleNamespace(variance_beside_bias=lambda kind, count, duration, keys: np.full((n, 3), 4e-6), bias_variance=1e-2)
     attempt = SimpleNamespace(space=SimpleNamespace(mean={'gyroscope': [np.full((n, 1), 0.01)] * 3}, places=lambda sensor, axis: [0]),

@@ -199,8 +199,7 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     for sensor, rest in diagnosis.unexplained.items():
         if rest.significant:
             with_what = f'; it correlates with {rest.correlates_with}' if rest.correlates_with else ''
-            lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}'
-                         + (f'; {rest.where}' if rest.where else ''))
+            lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}')
         lines += [f'   {line}' if rest.significant else line for line in (*beyond_lines(sensor, rest), *formula_lines(sensor, rest))]
     if diagnosis.not_testable:
         lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))

@@ -22,7 +22,7 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regime_variables import Variable, ranged
 from imu_calibration.selection.regimes import BY_CHANCE, Rest, RestRegime, RegimeSearch, exchanges
 from imu_calibration.selection.residual_fit import LEAST_OF_AXIS
-from imu_calibration.selection.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations, where_most
+from imu_calibration.selection.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations
 
 NORM = 'norm'
 """Without a table only the component of the accelerometer's error along gravity is observable."""
@@ -130,14 +130,14 @@ def rest_of(hand: HandCalibration, inquiry: Any, named: Sequence[Question], *, s
     significant = bool(sigma > SIGNIFICANT and count >= LEAST_WINDOWS)
     unit = None if chosen is None or chosen.duration is None else PER_TURN
     if not significant:
-        return Unexplained(False, rms, float(max(sigma, -99.0)), None, 0.0, None, layers, noise_sd, unit)
+        return Unexplained(False, rms, float(max(sigma, -99.0)), None, 0.0, layers, noise_sd, unit)
     name, share = correlate(_explanations(hand), layers / noise_sd)
     if chosen is not None and chosen.name == 'turns' and name is None:
         name = 'motion (turns between poses)'
     heldout = inquiry.evidence.heldout_residuals(used)[first]
     excess = ((heldout / noise_sd)**2 - 1.0).sum(axis=0)
     axes = [AXES[k] for k in np.argsort(-excess) if excess[k] > LEAST_OF_AXIS * excess.max() > 0] if len(excess) == len(AXES) else []
-    return Unexplained(True, rms, float(sigma), name, share, where_most(hand.poses.time, layers, noise_sd), layers, noise_sd, unit,
+    return Unexplained(True, rms, float(sigma), name, share, layers, noise_sd, unit,
                        tuple(axes), regimes_by_hand(hand, inquiry.blocks[first], heldout))
 
 
