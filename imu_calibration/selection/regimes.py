@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from imu_calibration.core.constants import DEG
+from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.regime_variables import FEWEST, Variable, variables_of
