@@ -45,7 +45,7 @@ LOST_SHARE = 0.05
 def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     """Return the notes; arguments as in `verdict.judge`."""
     remaining = [Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)]
-    return (_worse(calibration) + _unused_rests(calibration) + remaining + _adopted(calibration) + _loose(calibration)
+    return (_worse(calibration) + _unused_rests(calibration) + remaining + _adopted(calibration)
             + unsteady(calibration, tolerances) + _left_out(calibration) + _lost(calibration))
 
 
@@ -102,10 +102,14 @@ def _with_size(calibration, name):
     return f'{name} ({significant(calibration.values[best] * factor)} ± {significant(calibration.sd[best] * factor, 2)} {unit})'
 
 
-def _loose(calibration):
-    return [Reason(NOTE, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}',
-                   'find the cause where it matters', key='diagnose')
-            for sensor in SENSORS for kind, ratio in misfit_ratios(calibration, sensor).items() if LOOSE < ratio <= MISFIT]
+def misfits(calibration: Calibration) -> list[Reason]:
+    """Return the residuals above the noise at rest: notes, or warnings where they are far above; diagnoses use the same test."""
+    return [Reason(WARNING if ratio > MISFIT else NOTE,
+                   f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}: '
+                   f'the model is incomplete{", although the calibration helps in each regime" if helps else ""}',
+                   'find the cause', key='diagnose', sensors=(sensor,))
+            for sensor in SENSORS for helps in [rested(calibration) and helps_everywhere(calibration.proof.get(sensor))]
+            for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > LOOSE]
 
 
 def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
@@ -173,7 +177,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     within = found.count(DETERMINED)
     reasons = [_decided(calibration, sensor, word) for sensor, word in decisions.items()]
     reasons.append(_parameters(calibration, within, limiting, complete=within == len(found) and set(decisions.values()) == {HELPS}))
-    reasons += _undetermined(calibration) + _blind(calibration) + _implausible(calibration) + _misfits(calibration)
+    reasons += _undetermined(calibration) + _blind(calibration) + _implausible(calibration) + misfits(calibration)
     return Verdict(decisions, (*reasons, *_strange_causes(calibration), *notes_on(calibration, tolerances)), within, len(found), limiting)
 
 
@@ -240,15 +244,6 @@ def _strange_causes(calibration):
                    f'see the evidence; if {name} is expected, name it in the model',
                    key='diagnose', sensors=_whose([catalogue.get(name, '')]))
             for name, share in found.items()]
-
-
-def _misfits(calibration):
-    """Return the residuals in motion that are far above the noise at rest."""
-    return [Reason(WARNING, f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}: '
-                            f'the model is incomplete{", although the calibration helps in each regime" if helps else ""}',
-                   'find the cause', key='diagnose', sensors=(sensor,))
-            for sensor in SENSORS for helps in [rested(calibration) and helps_everywhere(calibration.proof.get(sensor))]
-            for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > MISFIT]
 
 
 def _blind(calibration):

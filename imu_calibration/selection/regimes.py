@@ -69,8 +69,8 @@ class RestRegime:
 
     def to_mapping(self) -> dict:
         """Return the regime as plain data."""
-        return {'axis': self.axis, 'variable': self.variable, 'text': self.text, 'share': self.share, 'p_value': self.p_value, 'size': self.size,
-                'bounds': None if self.bounds is None else list(self.bounds)}
+        return {'axis': self.axis, 'variable': self.variable, 'text': self.text, 'share': self.share, 'p_value': self.p_value,
+                'size': self.size, 'bounds': None if self.bounds is None else list(self.bounds)}
 
 
 def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, joint_names: Sequence[str], axes: Sequence[str] = AXES,
@@ -255,7 +255,7 @@ class RegimeSearch:
         return _largest_share_first(found)
 
     def _refined(self, rest, white, each, number):
-        """Return (share of each block inside, bounds, words, offset, residual sum of squares) of a range with its best bounds between rows."""
+        """Return (share of each block inside, bounds, words, offset, residual sum of squares) of a range with refined bounds."""
         variable, chosen = each.variable, each.variable.chosen(each.member[number])
         bounds, mark = variable.bounds(chosen), each.marks[:, chosen].sum(axis=1)
         for end in (0, 1) if bounds else ():
@@ -308,7 +308,7 @@ class RegimeSearch:
         return _largest_share_first(found)
 
     def _falls(self, rough, weight):
-        """Return for each variable the fall of the cost by a separate variance in each range, zero where it is hardly larger, shape (r, m)."""
+        """Return per variable the fall of the cost by a separate variance in each range, zero where it is hardly larger, (r, m)."""
         squares, count, gains = rough * weight[:, None], weight.sum(), []
         energy = squares.sum(axis=0)
         for each in self._ranges:
@@ -321,7 +321,7 @@ class RegimeSearch:
         return gains
 
     def _tested(self, gains):
-        """Return (p-value of the largest gain, shape of each (r, 1 + m), the likeliest ranges as (_Ranges, number), in order of variables)."""
+        """Return (p-value of the largest of the gains (r, 1 + m), the likeliest ranges (_Ranges, number) in order of variables)."""
         if not gains:
             return 1.0, []
         largest = np.max([each.max(axis=0) for each in gains], axis=0)

@@ -134,12 +134,13 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
         rows = np.concatenate([columns_of[sensor], mean], axis=1)
         design = tuple(rows @ join for join in attempt.space.join[sensor])
         found[sensor] = RestBlocks(sensor, references.at(sensor), **common, design=design, index=tuple(attempt.space.index[sensor]),
-                                   variance=variance, processes=processes, **_roughness(residual, windows, edges, least=LEAST_NOISE[sensor]))
+                                   variance=variance, processes=processes,
+                                   **_roughness(residual, windows, edges, least=LEAST_NOISE[sensor]))
     return found
 
 
 def _roughness(residual, windows, edges, least):
-    """Return the variance by second differences within blocks that begin at the samples `edges`, at least that of rounding, and its freedom."""
+    """Return the variance by second differences in blocks that begin at the samples `edges`, at least rounding, and its freedom."""
     inner, ends = np.ones(len(residual)), np.cumsum([len(window) for window in windows])
     inner[ends - 1] = inner[np.append(0, ends[:-1])] = 0.0
     bends = np.diff(residual, 2, axis=0, prepend=residual[:1], append=residual[-1:])

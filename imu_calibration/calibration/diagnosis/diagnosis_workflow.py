@@ -17,7 +17,7 @@ from imu_calibration.calibration.hand_workflow import evident_result, read_by_ha
 from imu_calibration.calibration.table_calibration import conclude, solve_recordings
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.verdict import unsteady
+from imu_calibration.document.verdict import misfits, unsteady
 from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
 from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
@@ -73,10 +73,10 @@ class DiagnosisResult:
 
     @property
     def notes(self) -> list[str]:
-        """Biases that step or wander on every axis: they count as noise of the sensor, not as unexplained residual."""
+        """Residuals above the noise at rest, and biases that step or wander on every axis, of sensors without an unexplained residual."""
         quiet = {sensor for sensor, rest in self.diagnosis.unexplained.items() if not rest.significant}
-        return [f'{reason.what}; no effect of the catalogue explains this step or wander'
-                for reason in unsteady(self.calibration, self.tolerances) if quiet.issuperset(reason.sensors)]
+        reasons = [*misfits(self.calibration), *unsteady(self.calibration, self.tolerances)]
+        return [f'{reason.what}; no effect of the catalogue explains it' for reason in reasons if quiet.issuperset(reason.sensors)]
 
     @property
     def lags(self) -> dict[str, tuple[float, float]]:

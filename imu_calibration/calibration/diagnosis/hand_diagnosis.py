@@ -20,7 +20,7 @@ from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.model_selection import HandInvestigation, investigate_by_hand
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regime_variables import Variable, ranged
-from imu_calibration.selection.regimes import BY_CHANCE, Rest, RestRegime, RegimeSearch, exchanges
+from imu_calibration.selection.regimes import BY_CHANCE, RegimeSearch, Rest, RestRegime, exchanges
 from imu_calibration.selection.residual_fit import LEAST_OF_AXIS
 from imu_calibration.selection.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations
 
