@@ -93,10 +93,11 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
     """
     exchange = exchanges(blocks.window, attempt.recording.kind[blocks.window], np.linalg.norm(blocks.means(blocks.ref.rate_s), axis=1))
     search, level = RegimeSearch(blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange), BY_CHANCE / len(AXES)
-    white, found = blocks.whitener(np.ones(len(blocks.time), bool)) if len(axes) else None, []
+    white, found = None, []
     for axis, name in enumerate(AXES):
         offsets = []
         if name in axes:
+            white = white or blocks.whitener(np.ones(len(blocks.time), bool))
             at = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
             own, scaled = blocks.index[axis][at], partial(_scaled, white, white.scale[axis])
             rest = Rest(scaled(blocks.design[axis][:, [*at, -1]]), 1 / attempt.space.prior_sd[own]**2, attempt.space.prior_mean[own])
