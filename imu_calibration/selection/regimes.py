@@ -100,7 +100,7 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
             white = white or blocks.whitener(np.ones(len(blocks.time), bool))
             at = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
             own, scaled = blocks.index[axis][at], partial(_scaled, white, white.scale[axis])
-            rest = Rest(scaled(blocks.design[axis][:, [*at, -1]]), 1 / attempt.space.prior_sd[own]**2, attempt.space.prior_mean[own])
+            rest = AxisResidual(scaled(blocks.design[axis][:, [*at, -1]]), 1 / attempt.space.prior_sd[own]**2, attempt.space.prior_mean[own])
             offsets = search.offsets(name, rest, scaled, level=level / 2, formula=None if formula is None else formula[:, :, axis])
         found += offsets or search.scatters(name, blocks.rough[:, axis], blocks.freedom, level=level / 2)
     return found
@@ -147,7 +147,7 @@ def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray, *, se
     return starts[taken] + (np.arange(len(window)) - starts[place]) % count[taken]
 
 
-class Rest:
+class AxisResidual:
     """
     The residual of one axis, independent and of unit variance, beside the columns of the model.
 
@@ -217,7 +217,7 @@ class RegimeSearch:
             if allowed.any():
                 self._ranges.append(_Ranges(variable, marks, member[allowed]))
 
-    def offsets(self, axis: str, rest: Rest, white: Callable, *, level: float, formula: np.ndarray | None = None) -> list[RestRegime]:
+    def offsets(self, axis: str, rest: AxisResidual, white: Callable, *, level: float, formula: np.ndarray | None = None) -> list[RestRegime]:
         """
         Return the ranges with another offset, the likeliest first, without those that a smooth curve or a formula describes as well.
 
@@ -226,7 +226,7 @@ class RegimeSearch:
         Parameters
         ----------
         axis : str
-        rest : Rest
+        rest : AxisResidual
         white : callable
             Makes columns over the blocks independent and of unit variance, as the rows of `rest`.
         level : float

@@ -20,7 +20,7 @@ from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.model_selection import HandInvestigation, investigate_by_hand
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regime_variables import Variable, ranged
-from imu_calibration.selection.regimes import BY_CHANCE, RegimeSearch, Rest, RestRegime, exchanges
+from imu_calibration.selection.regimes import BY_CHANCE, AxisResidual, RegimeSearch, RestRegime, exchanges
 from imu_calibration.selection.residual_fit import LEAST_OF_AXIS
 from imu_calibration.selection.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations
 
@@ -50,7 +50,7 @@ def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -
     search, found = RegimeSearch(block.sensor, block.time, _variables(hand, block), exchange), []
     for axis, name in enumerate(names):
         sd = np.sqrt(block.floor[:, axis])
-        rest = Rest(np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None], np.zeros(1), np.zeros(1))
+        rest = AxisResidual(np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None], np.zeros(1), np.zeros(1))
         found += search.offsets(name, rest, partial(np.multiply, 1.0 / sd[:, None]), level=BY_CHANCE / len(names))[:1]
     return tuple(found)
 
