@@ -100,7 +100,8 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
             white = white or blocks.whitener(np.ones(len(blocks.time), bool))
             at = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
             own, scaled = blocks.index[axis][at], partial(_scaled, white, white.scale[axis])
-            rest = AxisResidual(scaled(blocks.design[axis][:, [*at, -1]]), 1 / attempt.space.prior_sd[own]**2, attempt.space.prior_mean[own])
+            prior = 1 / attempt.space.prior_sd[own]**2, attempt.space.prior_mean[own]
+            rest = AxisResidual(scaled(blocks.design[axis][:, [*at, -1]]), *prior)
             offsets = search.offsets(name, rest, scaled, level=level / 2, formula=None if formula is None else formula[:, :, axis])
         found += offsets or search.scatters(name, blocks.rough[:, axis], blocks.freedom, level=level / 2)
     return found
@@ -217,7 +218,8 @@ class RegimeSearch:
             if allowed.any():
                 self._ranges.append(_Ranges(variable, marks, member[allowed]))
 
-    def offsets(self, axis: str, rest: AxisResidual, white: Callable, *, level: float, formula: np.ndarray | None = None) -> list[RestRegime]:
+    def offsets(self, axis: str, rest: AxisResidual, white: Callable, *, level: float,
+                formula: np.ndarray | None = None) -> list[RestRegime]:
         """
         Return the ranges with another offset, the likeliest first, without those that a smooth curve or a formula describes as well.
 
