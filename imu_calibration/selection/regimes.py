@@ -92,7 +92,7 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
 
     """
     exchange = exchanges(blocks.window, attempt.recording.kind[blocks.window], np.linalg.norm(blocks.means(blocks.ref.rate_s), axis=1))
-    search, level = RegimeSearch(blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange), BY_CHANCE / len(AXES)
+    search, level = RegimeSearch(blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange), BY_CHANCE / len(AXES)
     white, found = None, []
     for axis, name in enumerate(AXES):
         offsets = []
@@ -209,7 +209,7 @@ class RegimeSearch:
 
     """
 
-    def __init__(self, sensor: str, time: np.ndarray, variables: Sequence[Variable], exchange: np.ndarray):
+    def __init__(self, sensor: str, time: np.ndarray, variables: Sequence[Variable], *, exchange: np.ndarray):
         self.sensor, self.time, self._exchange, self._ranges = sensor, time, exchange, []
         for variable in variables:
             marks, member = variable.marks, variable.ranges

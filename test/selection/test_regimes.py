@@ -62,7 +62,7 @@ def test_a_formula_that_explains_as_much_is_no_place(monkeypatch):
     step = 30.0 * (TIME >= 122)
     rows = np.stack([np.ones(len(TIME)), step + np.random.default_rng(4).normal(size=len(TIME))], axis=1)
     exchange = regimes.exchanges(WINDOW, np.zeros(len(TIME)), np.ones(len(TIME)))
-    search = regimes.RegimeSearch('gyroscope', TIME, ranged('time', TIME, 's', starts=STARTS), exchange)
+    search = regimes.RegimeSearch('gyroscope', TIME, ranged('time', TIME, 's', starts=STARTS), exchange=exchange)
     rest = regimes.AxisResidual(rows, np.zeros(1), np.zeros(1))
     assert search.offsets('x', rest, np.asarray, level=0.05)
     assert not search.offsets('x', rest, np.asarray, level=0.05, formula=step[:, None])

@@ -175,8 +175,8 @@ def _gain(gain):
 def _rest(sensor, rest, locked):
     unit = rest.unit or UNIT[sensor]
     return {'significant': rest.significant, 'rms': rest.rms, 'unit': unit, 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
-            'share': rest.share, 'axes': list(rest.axes), 'regimes': [regime.to_mapping() for regime in rest.regimes],
-            'tones': [tone.to_mapping() for tone in rest.tones],
+            'share': rest.share, 'where': '; '.join(regime.text for regime in rest.regimes) or None, 'axes': list(rest.axes),
+            'regimes': [regime.to_mapping() for regime in rest.regimes], 'tones': [tone.to_mapping() for tone in rest.tones],
             'proposals': [] if rest.proposal is None else [rest.proposal.to_mapping() | {'gain': _gain(formula_gain(rest, locked))}]}
 
 

@@ -47,7 +47,7 @@ def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -
     names = AXES if residual.shape[1] == len(AXES) else (NORM,)
     poses = np.arange(len(residual))
     exchange = exchanges(poses, np.zeros(len(poses)), np.zeros(len(poses)))
-    search, found = RegimeSearch(block.sensor, block.time, _variables(hand, block), exchange), []
+    search, found = RegimeSearch(block.sensor, block.time, _variables(hand, block), exchange=exchange), []
     for axis, name in enumerate(names):
         sd = np.sqrt(block.floor[:, axis])
         rest = AxisResidual(np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None], np.zeros(1), np.zeros(1))
