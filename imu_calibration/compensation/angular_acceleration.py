@@ -195,11 +195,10 @@ class StampedDerivative:
 
     def _regular(self, stamp_ns, values, start, end, out):
         """Fill out[start:end], where every step is regular and the window is full of samples of this very stretch."""
-        from scipy.signal import lfilter  # here, because the import of scipy.signal is slow
         taps = self.taps
         index = (taps - 1) / 2 - np.arange(taps)
         stretch = values[start - taps + 1:end]
-        out[start:end] = lfilter(index * self._scale[taps], [1.0], stretch, axis=0)[taps - 1:]
+        out[start:end] = np.stack([np.convolve(axis, index * self._scale[taps], 'valid') for axis in stretch.T], axis=1)
         self._newest, self.alpha = int(stamp_ns[end - 1]), tuple(out[end - 1].tolist())
         self._window = deque(map(tuple, values[end - taps:end].tolist()))
         self._refresh()

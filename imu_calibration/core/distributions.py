@@ -7,7 +7,7 @@ all remaining modules together, and every command and node would wait for it.
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtrc, chdtri, fdtrc, ndtr, ndtri
+from scipy.special import bdtrc, chdtrc, chdtri, fdtrc, ndtr, ndtri
 
 
 def chi2_sf(x: ArrayLike, dof: ArrayLike) -> np.ndarray:
@@ -23,6 +23,11 @@ def chi2_isf(chance: ArrayLike, dof: ArrayLike) -> np.ndarray:
 def f_sf(x: ArrayLike, dof: ArrayLike, dof_below: ArrayLike) -> np.ndarray:
     """Return the probability that F lies above `x`, with the degrees of freedom above and below the line; one below zero."""
     return fdtrc(dof, dof_below, np.maximum(x, 0.0))
+
+
+def binom_sf(x: ArrayLike, trials: ArrayLike, chance: float) -> np.ndarray:
+    """Return the probability of more than `x` successes in `trials` (int) of probability `chance`; one below zero."""
+    return bdtrc(x, trials, chance)
 
 
 def norm_sf(x: ArrayLike) -> np.ndarray:

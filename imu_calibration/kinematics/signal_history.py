@@ -3,6 +3,8 @@
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg.blas import dtbsv
 
 CORNER = 5.0
 """
@@ -46,8 +48,6 @@ class BandVariance:
 
     def of(self, period: float, force_s: np.ndarray) -> np.ndarray:
         """Return the variances after each of the next samples, shape (n, 3): the same as `push` one by one."""
-        from scipy.signal import lfilter  # here, because its import is slow
-
         if not len(force_s):
             return np.zeros((0, 3))
         if not self._inputs:
@@ -55,16 +55,27 @@ class BandVariance:
         keep, forget = _decays(period)
         gain, values = 0.5 * (1.0 + keep), np.asarray(force_s, float)
         for stage in range(_STAGES):
-            state = keep * np.array(self._inputs[stage + 1]) - gain * np.array(self._inputs[stage])
+            steps = np.diff(values, axis=0, prepend=[self._inputs[stage]])
             self._inputs[stage] = values[-1].tolist()
-            values = lfilter([gain, -gain], [1.0, -keep], values, axis=0, zi=state[None])[0]
+            values = autoregressive(gain * steps, keep, self._inputs[stage + 1])
         self._inputs[_STAGES] = values[-1].tolist()
-        variance = lfilter([1.0 - forget], [1.0, -forget], values**2, axis=0, zi=forget * np.array(self.now)[None])[0]
+        variance = autoregressive((1.0 - forget) * values**2, forget, self.now)
         self.now = tuple(variance[-1].tolist())
         return variance
 
     def _begin(self, force):
         self._inputs = [list(force)] + [[0.0, 0.0, 0.0] for _ in range(_STAGES)]
+
+
+def autoregressive(drive: np.ndarray, decay: float, before: ArrayLike) -> np.ndarray:
+    """
+    Return ``y_k = decay y_(k-1) + drive_k``, shape (n, m), from ``y_(-1) = before``, shape (m,).
+
+    A unit triangular system with one band below the diagonal, as the import of scipy.signal is slow.
+    """
+    drive, band = np.array(drive, float), np.tile([[1.0], [-decay]], (1, len(drive)))
+    drive[:1] += decay * np.asarray(before)
+    return np.stack([dtbsv(1, band, column, lower=1, diag=1) for column in drive.T], axis=1)
 
 
 def _decays(period):

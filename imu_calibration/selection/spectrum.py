@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from imu_calibration.core.distributions import binom_sf
 from imu_calibration.core.units import DEG, for_people, significant
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.kinematics.table import Table
@@ -159,8 +160,6 @@ def _cut(rest, longest):
 
 def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float]], joint: str | None) -> Iterator[Tone]:
     """Yield the most significant Tone of each axis, if any; its p-value counts frequencies only."""
-    from scipy.stats import binom  # here, because its import is slow
-
     every = list(stretches)
     if not every:
         return
@@ -178,7 +177,7 @@ def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float
         excess[at] += np.maximum(power[at] - around[at], 0.0) * 4 / (2 / 3 * len(rest))   # of a line under a Hann window
     if not count.any():
         return
-    chance = np.where(hits > MOSTLY * count[:, None], binom.sf(hits - 1, count[:, None], BY_CHANCE) * np.count_nonzero(count), 1.0)
+    chance = np.where(hits > MOSTLY * count[:, None], binom_sf(hits - 1, count[:, None], BY_CHANCE) * np.count_nonzero(count), 1.0)
     for axis in range(3):
         mean = ratios[:, axis] / np.maximum(count, 1)
         # The highest significant peak: the surroundings are known by octaves only.
@@ -191,10 +190,10 @@ def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float
 
 def _powers(rest, size, inside):
     """Return (power, power around it by octaves, both shape (n, 3), which frequencies have enough around them)."""
-    from scipy.signal import detrend  # here, because its import is slow
-
-    window = np.hanning(len(rest))
-    power = np.abs(np.fft.rfft(detrend(rest, axis=0) * window[:, None], size, axis=0))**2 / (window**2).sum()
+    window, line = np.hanning(len(rest)), np.linspace(-1.0, 1.0, len(rest))[:, None]
+    level = rest - rest.mean(axis=0)
+    level -= line * (line * level).sum(axis=0) / (line**2).sum()
+    power = np.abs(np.fft.rfft(level * window[:, None], size, axis=0))**2 / (window**2).sum()
     around, inside = np.ones_like(power), inside.copy()
     octave = np.zeros(len(power), int)
     octave[1:] = np.log2(np.arange(1, len(power))).astype(int)

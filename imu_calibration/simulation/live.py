@@ -10,6 +10,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import clip, warped_reference
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import lever_matrix
+from imu_calibration.kinematics.signal_history import autoregressive
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.sensor_noise import Cause, Felt, quantise, read_encoders
 from imu_calibration.simulation.session import SimulationOptions, answered, temperature_at
@@ -140,8 +141,7 @@ class _Wander:
 
     def take(self, count):
         """Return the next values, shape (count, 3)."""
-        from scipy.signal import lfilter
         drive = self._rng.normal(0.0, self._drive_sd, (count, 3))
-        values, _ = lfilter([1.0], [1.0, -self._decay], drive, axis=0, zi=(self._decay * self._state)[None])
+        values = autoregressive(drive, self._decay, self._state)
         self._state = values[-1]
         return values

@@ -10,6 +10,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import DEG, DEG_H, MICRO_G, STANDARD_GRAVITY
+from imu_calibration.kinematics.signal_history import autoregressive
 
 
 @dataclass(frozen=True)
@@ -101,11 +102,10 @@ def gauss_markov(standard_deviation: float | np.ndarray, correlation_time: float
     ``x[k] = a x[k-1] + sd sqrt(1 - a^2) w[k]`` with ``a = exp(-step / correlation_time)``, started from its stationary
     distribution.
     """
-    from scipy.signal import lfilter  # here, because the import of scipy.signal is slow (1 s)
     decay = np.exp(-step / correlation_time)
     drive = rng.normal(0.0, standard_deviation, shape)
     drive[1:] *= np.sqrt(-np.expm1(-2.0 * step / correlation_time))
-    return lfilter([1.0], [1.0, -decay], drive, axis=0)
+    return autoregressive(drive.reshape(len(drive), -1), decay, 0.0).reshape(shape)
 
 
 def quantise(values: np.ndarray, step: float) -> np.ndarray:

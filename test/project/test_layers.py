@@ -17,6 +17,7 @@ EDGE = {'cli', 'nodes', 'use_cases', '__main__'}
 ROS = {'rclpy', 'ros2cli', 'ros2doctor', 'rosbags', 'ament_index_python', 'launch', 'launch_ros', 'rosgraph_msgs', 'std_srvs'}
 LATE = {'yaml', 'matplotlib', 'jinja2', 'rich', 'urdf_parser_py', 'xacro'}
 LATE_OF_SCIPY = ('scipy.optimize', 'scipy.signal', 'scipy.stats')
+NOT_IN_CALIBRATE = ('allan', 'papers', 'planning')
 """They would take half of the time in which a command or a node starts."""
 
 BLOCKED_IMPORTS = '''
@@ -116,6 +117,7 @@ def test_the_core_knows_nothing_of_ros_or_of_the_layers_above(path):
 def test_heavy_libraries_are_imported_where_they_are_used(path):
     names = imports(path, top_level_only=True)
     assert not heads(names) & LATE and not inside(names, *LATE_OF_SCIPY)
+    assert not inside(imports(path), 'scipy.signal', 'scipy.stats') or module_name(path).split('.')[1] in NOT_IN_CALIBRATE
 
 
 @pytest.mark.parametrize('path', modules('msg_adapters'), ids=module_name)
