@@ -283,23 +283,19 @@ def _keeps_attitude(force, period):
 
 
 def _at_one_rate(rate, found, period, shortest):
-    """Divide intervals where the rate changes by more than its noise: a transition from rest to a slow turn that is as quiet."""
+    """Divide intervals where the rate changes by its noise and a thousandth of the largest: a transition from rest to a slow turn."""
     if not found:
         return found
     noise = np.median([rate[piece].std(axis=0) for piece in found], axis=0)
+    least = np.maximum(noise, 1e-3 * np.abs(rate - np.median(rate, axis=0)).max(axis=0))
     width, parts = max(10, int(round(_STEP_SPAN / period))), []
     for piece in found:
         count = (piece.stop - piece.start) // width
         means = rate[piece.start:piece.start + count * width].reshape(count, width, 3).mean(axis=1)
-        steps = np.flatnonzero(np.any(np.abs(np.diff(means, axis=0)) > np.maximum(noise, _least_step(rate)), axis=1)) + 1
+        steps = np.flatnonzero(np.any(np.abs(np.diff(means, axis=0)) > least, axis=1)) + 1
         edges = [piece.start, *(piece.start + width * steps), piece.stop]
         parts += [slice(int(a), int(b)) for a, b in zip(edges, edges[1:]) if (b - a) * period >= shortest or len(edges) == 2]
     return parts
-
-
-def _least_step(rate):
-    """Return the least rate step, shape (3,): a thousandth of the largest rate."""
-    return 1e-3 * np.abs(rate - np.median(rate, axis=0)).max(axis=0)
 
 
 def _trimmed(imu, found, period, shortest):
