@@ -121,7 +121,7 @@ def bench_compensator(seconds=30.0):
         path.write_text(bench_calibration())
         nodes = [Process('plain relay', [sys.executable, ENDS, 'relay', []], environment),
                  Process('compensator', [sys.executable, '-m', 'imu_calibration.nodes.compensator_node',
-                                         ['-p', f'calibration_file:={path}']], environment)]
+                                         ['-p', f'calibration_file:={path}', '-p', 'anyway:=true']], environment)]
         try:
             time.sleep(4.0)
             direct = compare(nodes, seconds, environment)
