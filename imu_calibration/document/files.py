@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from errno import EISDIR
+from functools import lru_cache
 from itertools import count
 from os import PathLike
 from pathlib import Path
@@ -170,9 +171,16 @@ def write_text(path: str | PathLike[str], text: str) -> None:
 
 def hash_of(path: str | PathLike[str]) -> str:
     """Return the SHA-256 of a file, or of the data files of a bag in order of name, as hexadecimal digits."""
-    path, digest = Path(path), hashlib.sha256()
+    path = Path(path)
     files = sorted(f for f in path.rglob('*') if f.is_file() and f.name != 'metadata.yaml') if path.is_dir() else [path]
-    for file in files:
+    return _hash_of_unchanged(tuple((file, (state := file.stat()).st_size, state.st_mtime_ns, state.st_ino) for file in files))
+
+
+@lru_cache
+def _hash_of_unchanged(files):
+    """Return the hash of (path, size, time of the last change, inode) of each file: a bag is read once in a process."""
+    digest = hashlib.sha256()
+    for file, *_ in files:
         with open(file, 'rb') as stream:
             while chunk := stream.read(1 << 20):
                 digest.update(chunk)

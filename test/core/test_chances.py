@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from imu_calibration.core.distributions import chi2_isf, chi2_sf, f_sf, norm_ppf, norm_sf
+from imu_calibration.core.distributions import binom_sf, chi2_isf, chi2_sf, f_sf, norm_ppf, norm_sf
 
 RNG = np.random.default_rng(1)
 VALUES = np.concatenate([RNG.exponential(10.0, 300), RNG.normal(0.0, 3.0, 200), [0.0, 1e-300, 1e300, np.inf, -np.inf, np.nan]])
@@ -20,6 +20,12 @@ def test_chi_square_and_f_have_the_tails_of_scipy_stats(dof):
         np.testing.assert_array_equal(f_sf(VALUES, dof, below), stats.f.sf(VALUES, dof, below))
     if dof > 0:
         np.testing.assert_array_equal(chi2_isf(CHANCES, dof), stats.chi2.isf(CHANCES, dof))
+
+
+def test_binomial_numbers_have_the_tail_of_scipy_stats():
+    x, trials = np.arange(-1, 31)[:, None], np.array([1, 7, 30])
+    x = np.minimum(x, trials)
+    np.testing.assert_allclose(binom_sf(x, trials, 0.3), stats.binom.sf(x, trials, 0.3), rtol=1e-12, atol=1e-300)
 
 
 def test_gaussian_numbers_have_the_tails_of_scipy_stats():

@@ -1,5 +1,7 @@
 """What a result says of its origin, and that it does not replace the result of other inputs."""
 
+import hashlib
+import os
 import re
 from pathlib import Path
 
@@ -71,6 +73,16 @@ def test_options_in_memory_and_robots_are_named(tmp_path):
     assert options['gravity'] == 9.81 and options['setting'] == ['settling=1.0'] and options['up'] == [0, 0, 1]
     assert options['urdf'] == {'name': 'arm.urdf', 'sha256': files.hash_of(tmp_path / 'arm.urdf')} and options['model_as_asked'] is True
     assert options['tolerances']['name'] == 'in memory' and len(options['tolerances']['sha256']) == 64 and 'serial' not in options
+
+
+def test_a_file_is_read_again_for_its_hash_only_after_a_change(tmp_path):
+    (path := tmp_path / 'a').write_bytes(b'a')
+    before, state = files.hash_of(path), path.stat()
+    path.write_bytes(b'b')
+    os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert files.hash_of(path) == before
+    os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns + 1))
+    assert files.hash_of(path) == hashlib.sha256(b'b').hexdigest()
 
 
 def test_hashes_of_earlier_versions_are_recognised():
