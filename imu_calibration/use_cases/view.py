@@ -243,7 +243,8 @@ def _topics(traces, joint_names):
             names = [name.replace(' ', '_') for name in segment.signals]
             rows = np.column_stack(list(segment.signals.values()))
             yield f'{OVERLAY}/{sensor}/{axis}', [(time, dict(zip(names, row))) for time, row in zip(segment.time.tolist(), rows.tolist())]
-        yield f'{OVERLAY_RESIDUAL}/{sensor}', [(float(traces.time[k]), _residual(traces, sensor, joint_names, k)) for k in range(len(traces.time))]
+        yield (f'{OVERLAY_RESIDUAL}/{sensor}',
+               [(float(traces.time[k]), _residual(traces, sensor, joint_names, k)) for k in range(len(traces.time))])
         if sensor in traces.distances:
             frequency, density, noise = traces.distances[sensor].density()
             yield f'{OVERLAY_SPECTRUM}/{sensor}', [(time, {'frequency': frequency.tolist(), 'noise': _by_axis(noise),
