@@ -49,5 +49,5 @@ def run(options: Namespace) -> VerbResult:
         shown, spread = with_sd(value * 1e3, sd * 1e3)
         out.print(f'{axis}: {shown} +- {spread} mm')
     for line in result.lines():
-        out.print(line, soft_wrap=True)
+        out.print(line)
     return VerbResult(0, {'arm': result.arm, 'sd': result.arm_sd, 'unit': 'm', 'notes': list(result.lines())})

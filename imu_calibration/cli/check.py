@@ -36,5 +36,5 @@ def run(options: Namespace) -> VerbResult:
                          ratio_text(part)))
     show_table(out, ('sensor', 'motion', *numbers), rows, numbers=numbers)
     for line in str(found).splitlines():
-        out.print(line, soft_wrap=True, markup=False)
+        out.print(line, markup=False)
     return VerbResult(found.exit_code, {'proof': found.proof, 'helps': found.helps})

@@ -29,7 +29,7 @@ def run(options: Namespace) -> VerbResult:
                       '-' if row.ratio is None else f'{row.ratio:.1f}'))
     show_table(out, ('parameter', *numbers[:-1], 'unit', 'in sd'), shown, numbers=numbers)
     for line in result.lines:
-        out.print(line, soft_wrap=True)
+        out.print(line)
     rows = [{'name': row.name, 'first': row.first, 'second': row.second, 'sd': row.sd, 'unit': row.unit, 'ratio': row.ratio}
             for row in result.rows]
     return VerbResult(0, {'rows': rows, 'lines': list(result.lines)})

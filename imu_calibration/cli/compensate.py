@@ -3,7 +3,7 @@
 from argparse import Namespace
 
 from imu_calibration.cli.arguments import BAG, add_topic_arguments
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
 
 EXAMPLES = ('drive --calibration result/calibration.yaml --output drive_corrected',
             'drive --calibration calibration.yaml --target-frame base_link --target-xyz 0.1 0 0.2 --output drive_corrected')
@@ -35,7 +35,7 @@ def run(options: Namespace) -> VerbResult:
              'temperature_topic', 'frame_id')
     found = compensate(options.bag, options.calibration, **{name: getattr(options, name) for name in names})
     for line in found.warnings:
-        print(f'note: {line}')
+        print(folded(f'note: {line}'))
     print(f'written: {options.output} with {options.corrected_topic} ({found.count} samples)')
     if found.lost:
         print('lost: ' + ', '.join(f'{count} {reason}' for reason, count in found.lost.items()))

@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
 from msg_adapters.storages import identifiers
 
 EXAMPLES = ('log.csv --output session', 'log.csv --columns time=t:ms force=ax,ay,az:g rate=gx,gy,gz:deg/s --output session')
@@ -28,7 +28,7 @@ def run(options: Namespace) -> VerbResult:
     for columns in log.columns:
         print(columns)
     if log.unused:
-        print(f'unused: {", ".join(log.unused)}')
+        print(folded(f'unused: {", ".join(log.unused)}'))
     write_session(options.output, log.imu, log.joints, temperature=log.temperature, storage=options.storage)
     print(f'written: {options.output} ({len(log.imu)} Imu)')
     columns = [{'quantity': c.quantity, 'joint': c.joint, 'names': c.names, 'unit': c.unit, 'origin': c.origin} for c in log.columns]

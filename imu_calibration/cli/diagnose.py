@@ -37,7 +37,7 @@ def run(options: Namespace) -> VerbResult:
         if options.mcap:
             found.save_overlay(options.mcap)
         out = console()
-        out.print(str(found), soft_wrap=True)
+        out.print(str(found))
         also = '' if found.proposed is None else ', and extended.yaml with the proposed formula in the model,'
-        out.print(f'written: diagnosis.json, calibration.yaml and report.html{also} in {folder}', soft_wrap=True)
+        out.print(f'written: diagnosis.json, calibration.yaml and report.html{also} in {folder}')
         return VerbResult(found.exit_code, found.document)

@@ -180,11 +180,11 @@ def show_fleet(results: Sequence[UnitResult], spreads: Sequence[Spread], folder:
     out = console()
     show_table(out, COLUMNS, map(shown, spreads), numbers=[COLUMNS[k] for k in (1, 2, 3, 5)])
     for result in results:
-        out.print(f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict_text}', soft_wrap=True, markup=False)
+        out.print(f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict_text}', markup=False)
         if result.calibration is not None:
             warn({'text': f'{result.name}: {found["text"]}'} for found in result.calibration.statistics['preflight'])
     calibrated = sum(result.calibration is not None for result in results)
-    out.print(f'written: {calibrated} of {len(results)} units, summary.csv, units.csv and summary.html in {folder}', soft_wrap=True)
+    out.print(f'written: {calibrated} of {len(results)} units, summary.csv, units.csv and summary.html in {folder}')
 
 
 def summary_html(results: Sequence[UnitResult], spreads: Sequence[Spread]) -> str:

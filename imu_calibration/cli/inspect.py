@@ -92,7 +92,7 @@ def _show_unread(out, recording, hints):
         names = [topic.name for topic in recording.topics if topic.type == message_type]
         if names and getattr(recording, key) is None:
             text = f'not read: {", ".join(names)}, no telling which belongs to the IMU; choose one'
-            out.print(with_hint(text, key, hints), soft_wrap=True)
+            out.print(with_hint(text, key, hints))
 
 
 def _step(step_ns):
@@ -110,7 +110,7 @@ def _judge(out, look, hints):
     if result is None or look.refused:
         return 0
     if isinstance(result, ImuCalibrationError):
-        out.print(f'not usable for calibration: {result.told(hints)}', soft_wrap=True, markup=False)
+        out.print(f'not usable for calibration: {result.told(hints)}', markup=False)
         return 3
     out.print()
     for kind, count in result.calibration.statistics['windows'].items():
@@ -122,11 +122,10 @@ def _judge(out, look, hints):
 def _show_by_hand(out, found, hints):
     """Print whether the recording can be calibrated by hand, and which parameters that determines."""
     if isinstance(found, ImuCalibrationError):
-        out.print(f'not usable for calibration without a table: {found.told(hints)}', soft_wrap=True, markup=False)
+        out.print(f'not usable for calibration without a table: {found.told(hints)}', markup=False)
         return
     windows = found.calibration.statistics['windows']
-    out.print(f'by hand, without a table, it determines, from {windows["static"]} poses and {windows["turns"]} turns between them:',
-              soft_wrap=True)
+    out.print(f'by hand, without a table, it determines, from {windows["static"]} poses and {windows["turns"]} turns between them:')
     _show_parameters(out, found.calibration)
 
 
@@ -136,9 +135,9 @@ def _show_parameters(out, calibration):
     for name, status in calibration.status_by_name.items():
         groups.setdefault(status, []).append(name)
     for status, names in groups.items():
-        out.print(f'{status}: {", ".join(names)}', soft_wrap=True)
+        out.print(f'{status}: {", ".join(names)}')
     needs = {}
     for direction in calibration.undetermined:
         needs.setdefault(direction['needs'], {}).update(direction['parameters'])
     for motion, names in needs.items():
-        out.print(f'needs: {motion}  ({", ".join(names)})', soft_wrap=True)
+        out.print(f'needs: {motion}  ({", ".join(names)})')

@@ -3,10 +3,9 @@
 import sys
 from argparse import Namespace
 from itertools import groupby
-from textwrap import fill
 
 from imu_calibration.cli.arguments import add_topic_arguments
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
 
 EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
 
@@ -42,7 +41,7 @@ def run(options: Namespace) -> VerbResult:
 
 
 def _show(found, rates, folder, names):
-    """Print the figures, their remarks, and the figures for filters, in 80 columns."""
+    """Print the figures, their remarks, and the figures for filters."""
     from imu_calibration.allan import document
     for head, rows in groupby(document.rows(found.figures), lambda row: f'{row.sensor}, {row.title}, {row.unit}'):
         print(head)
@@ -50,5 +49,5 @@ def _show(found, rates, folder, names):
             print(f' {row.axis} {row.value:>8}  {row.interval:>17}  {row.status:<10}  {row.note}'.rstrip())
     print()
     for line in [*document.lines(found.figures), *document.filter_lines(found.figures, rates, found.horizon)]:
-        print(fill(line, 80, subsequent_indent='    '))
+        print(folded(line, '    '))
     print(f'written: {names} in {folder}')

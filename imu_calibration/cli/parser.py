@@ -5,6 +5,8 @@ import sys
 from argparse import Namespace
 from collections.abc import Mapping
 from importlib import import_module
+from shutil import get_terminal_size
+from textwrap import wrap
 from typing import Any, NamedTuple, NoReturn
 
 import imu_calibration
@@ -67,6 +69,14 @@ class OneLineParser(argparse.ArgumentParser):
         raise SystemExit(1)
 
 
+def folded(text: str, indent: str = '', last: str = '') -> str:
+    """Return a line for standard output, broken between words at the width of a terminal; `last` ends each but the last part."""
+    if not sys.stdout.isatty():
+        return text
+    width = get_terminal_size().columns - len(last)
+    return f'{last}\n'.join(wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False))
+
+
 def make_parser(verb: str | None = None) -> OneLineParser:
     """Return the parser of the plain command; `verb` as for `add_verbs`."""
     parser = OneLineParser(prog='imu_calibration', epilog=EXIT_CODES,
@@ -84,7 +94,7 @@ def add_verbs(parser: argparse.ArgumentParser, verb: str | None = None, *, requi
         raise SystemExit(1)
     verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=required, parser_class=OneLineParser)
     for name, text in VERBS.items():
-        added = verbs.add_parser(name, help=text, description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+        added = verbs.add_parser(name, help=text, description=folded(text), formatter_class=argparse.RawDescriptionHelpFormatter)
         if name != verb:
             continue
         module = import_module(f'imu_calibration.cli.{name}')
@@ -95,7 +105,8 @@ def add_verbs(parser: argparse.ArgumentParser, verb: str | None = None, *, requi
         added.set_defaults(run=module.run, verb_options=sorted(added._option_string_actions))
         words = [action for action in added._actions if action.required]
         added.usage = f'%(prog)s {" ".join(map(_usage, words))} [options]'
-        added.epilog = '\n'.join(['examples:', *(f'  imu_calibration {name} {example}' for example in module.EXAMPLES)])
+        examples = (f'  imu_calibration {name} {example}' for example in module.EXAMPLES)
+        added.epilog = '\n'.join(['examples:', *(folded(example, 6 * ' ', ' \\') for example in examples)])
 
 
 def _usage(action):

@@ -1,10 +1,9 @@
 """``imu_calibration plan``: the motions that bring every parameter within its tolerance."""
 
 from argparse import Namespace
-from textwrap import fill
 
 from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
 from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
@@ -69,9 +68,9 @@ def _run_by_hand(options):
         made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **{name: getattr(options, name) for name in CHOICES})
         made.save(folder, report=not options.no_report)
     for number, step in enumerate(made.plan.steps, start=1):
-        print(fill(f'{number:3d}  {step.words}', 96, subsequent_indent='     '))
+        print(folded(f'{number:3d}  {step.words}', '     '))
     for line in hand_summary(made.plan):
-        print(fill(line, 96, subsequent_indent='    '))
+        print(folded(line, '    '))
     print(f'written: plan.yaml in {folder}')
     return VerbResult(made.exit_code, hand_plan_to_mapping(made.plan, made.provenance))
 
@@ -98,9 +97,9 @@ def _show(planned, folder):
     from imu_calibration.use_cases.plan import summary
     made = planned.plan
     for end, motion in list(zip(made.ends, made.motions, strict=True))[:SHOWN]:
-        print(fill(f'until {end:6.1f} s  {motion.words}', 96, subsequent_indent=' ' * 16))
+        print(folded(f'until {end:6.1f} s  {motion.words}', ' ' * 16))
     if len(made.motions) > SHOWN:
         print(f'... and {len(made.motions) - SHOWN} more, in plan.yaml')
     for line in [*summary(made), *planned.notes]:
-        print(fill(line, 96, subsequent_indent='    '))
+        print(folded(line, '    '))
     print(f'written: plan.yaml and the trajectory in {folder}')

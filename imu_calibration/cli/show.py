@@ -13,12 +13,16 @@ if TYPE_CHECKING:
     from imu_calibration.use_cases.calibrate import Calibrated
 
 
+UNLIMITED = 10_000
+"""Width of a line in a file."""
+
+
 def console() -> Any:
-    """Return a console on standard output that does not break lines where it is no terminal."""
+    """Return a console on standard output: lines break between words at the width of a terminal, and nowhere in a file."""
     import sys
 
     from rich.console import Console
-    return Console(width=None if sys.stdout.isatty() else 140, highlight=False, markup=False)
+    return Console(width=None if sys.stdout.isatty() else UNLIMITED, highlight=False, markup=False)
 
 
 def show_table(out: Any, headings: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Collection[str] = (),
@@ -76,6 +80,6 @@ def show_calibration(found: 'Calibrated', folder: Path, hints: dict[str, str], *
     out = console()
     show_table(out, HEADINGS, parameter_rows(found.calibration), numbers=NUMBERS)
     for line in summary(found.result, hints)[1]:
-        out.print(line, soft_wrap=True)
+        out.print(line)
     files = 'calibration.yaml' + (' and report.html' if report else '')
-    out.print(f'written: {files} in {folder}', soft_wrap=True)
+    out.print(f'written: {files} in {folder}')

@@ -4,6 +4,7 @@ import fcntl
 import io
 import os
 import pty
+import re
 import struct
 import subprocess
 import sys
@@ -87,6 +88,14 @@ def on_terminal(arguments, **environment):
     os.close(ours)
     assert process.wait() == 0
     return found
+
+
+@pytest.mark.live
+@pytest.mark.parametrize('arguments', [['compensate', '--help'], ['convert', '--help'], ['effects'], ['inspect', SESSION], ['export', '--list']])
+def test_no_line_is_wider_than_the_terminal(arguments):
+    """The terminal itself would break them within a word: help up to 138 columns, equations, names of parameters."""
+    lines = re.sub(rb'\x1b\[[0-9;?]*[a-zA-Z]', b'', on_terminal(arguments)).decode().splitlines()
+    assert len(lines) > 10 and max(map(len, lines)) <= 80
 
 
 @pytest.mark.live
