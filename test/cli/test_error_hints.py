@@ -52,7 +52,7 @@ def test_no_text_of_the_core_tells_to_run_a_verb():
              if isinstance(node, ast.Constant) and isinstance(node.value, str)
              for verb in re.findall(r"(?<!written by )'imu_calibration (\w+)'", node.value)}
     # To apply a calibration to a recording, beside compensator_node; in a document that `import` writes.
-    assert found == {('verdict', 'compensate'), ('imported', 'check')}
+    assert found == {('verdict', 'compensate'), ('loss', 'check')}
 
 
 NAMED = {'setting': 'the text has the names of parameters of the node', 'imu_topic': 'no readings are compared'}
