@@ -262,7 +262,7 @@ def _point(found):
 
 def _moves(found, lacking=()):
     """Return (changes of parameters by other choices of effects, weight): rejected, doubtful, implausible or missing effects, rivals."""
-    moves = [(found.attempt.moved_by(found.named, question), 1.0)
+    moves = [(found.search.moved_by(found.named, question, found.attempt.space.names), 1.0)
              for question in (*found.denied, *found.doubtful, *found.implausible, *lacking)]
     moves += [(moved, 1.0) for moved in biases_off(found.attempt.baseline, found.rests)]
     return (*moves, *((rival.moves, rival.weight) for rival in found.rivals))

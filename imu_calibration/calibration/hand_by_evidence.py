@@ -58,7 +58,7 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
         found = replace(found, named=[q for q in found.named if q not in faint], denied=[*found.denied, *faint])
     added = tuple(q.name for q in found.adopted if q.name not in asked[q.sensor])
     changes = ModelChanges(added, tuple(question.name for question in found.denied),
-                           {question.name: found.inquiry.share(found.named, question) for question in found.implausible})
+                           {question.name: found.inquiry.explained.share(found.named, question) for question in found.implausible})
     return EvidentHand(hand, found, changes)
 
 
@@ -87,7 +87,7 @@ def extended_by_hand(data: HandData, found: 'HandInvestigation', options: HandOp
     hand = solve_by_hand(data, replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS}), found.point())
     terms = hand.terms
     for question in (*found.denied, *found.implausible):
-        moved = found.moved_by(question)
+        moved = found.search.moved_by(found.named, question, found.baseline.model.param_names)
         shift = np.array([moved.get(name, 0.0) for name in hand.param_names])
         terms = with_term(terms, REJECTED, np.outer(shift, shift))
     return replace(hand, terms=terms)

@@ -148,13 +148,6 @@ class Attempt:
         early = np.arange(len(judged.recording.windows)) < len(judged.recording.windows) // 2
         return [normal_matrix(judged, self.noise, half) for half in (early, ~early)]
 
-    def moved_by(self, chosen: Sequence[Question], question: Question) -> dict[str, float]:
-        """Return parameter -> by how much an effect moves it, of the baseline and of the other choices, when it joins them."""
-        others = [q for q in chosen if q is not question]
-        smaller, larger = self.search.used(others), self.search.used([*others, question])
-        moved = self.evidence.fit(larger)[0][:len(smaller)] - self.evidence.fit(smaller)[0]
-        return {self.space.names[k]: float(change) for k, change in zip(smaller, moved)}
-
     def acts_beside(self, chosen: Sequence[Question]) -> bool:
         """Return whether the point of linearisation has a lag, delay or error of the table that is not among the chosen effects."""
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)

@@ -1,6 +1,5 @@
 """How well a choice of parameters predicts windows that it was not fitted to: small problems on normal matrices."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -45,55 +44,91 @@ def _turn_of(kind, modulus):
     return turn
 
 
-class Evidence(ABC):
+class Evidence:
     """
-    Evidence for choices of parameters, each a sequence of indices.
+    Evidence for choices of parameters, each a sequence of indices, from rows of known noise in folds.
 
     Losses are minus twice log likelihoods, up to a constant.
 
     Parameters
     ----------
+    total : array, shape (q + 1, q + 1)
+        Normal matrix ``[design | residual]' V^-1 [design | residual]`` of all rows.
+    without : array, shape (n_folds, q + 1, q + 1)
+        The same of all rows but those of each fold.
     prior_sd, prior_mean : array, shape (q,)
         Prior of the parameters.
 
     """
 
-    def __init__(self, prior_sd: np.ndarray, prior_mean: np.ndarray):
-        self._prior = {'prior_sd': prior_sd, 'prior_mean': prior_mean}
+    def __init__(self, total: np.ndarray, without: np.ndarray, *, prior_sd: np.ndarray, prior_mean: np.ndarray):
+        self.total, self.without, self._prior = total, without, {'prior_sd': prior_sd, 'prior_mean': prior_mean}
         self._fits: dict[tuple, tuple] = Recent(MOST_FITS)
         self._losses: dict[tuple, float] = {}
         self._predictions: dict[tuple, np.ndarray] = {}
 
-    @abstractmethod
-    def normal(self, number: int | None = None) -> np.ndarray:
-        """Return the normal matrix of all folds, or of all but fold `number`, shape (q + 1, q + 1)."""
-
-    @abstractmethod
-    def loss(self, used: Sequence[int]) -> float:
-        """Return the loss of the best fit."""
-
-    @abstractmethod
-    def heldout(self, used: Sequence[int]) -> float:
-        """Return the loss on held-out data, all folds."""
-
-    @abstractmethod
-    def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
-        """Return the p-value of the choice `larger` against `smaller`."""
-
-    def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
-        """Return the loss on held-out data by sensor: of the windows' means and within the windows, of each axis, shape (2, 3)."""
-        raise NotImplementedError(f'{type(self).__name__} has no effect that acts on both sensors')
+    def equations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (matrix, right side) of the normal equations of all parameters on all rows, with the prior."""
+        known = 1 / self._prior['prior_sd']**2
+        return self.total[:-1, :-1] + np.diag(known), self.total[:-1, -1] + known * self._prior['prior_mean']
 
     def fit(self, used: Sequence[int], number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, covariance) of the parameters `used`, fitted to all folds or to all but fold `number`."""
         ordered = tuple(sorted(used))
         if (ordered, number) not in self._fits:
-            self._fits[ordered, number] = solve_normal(self.normal(number), np.array(ordered), **self._prior)
+            normal = self.total if number is None else self.without[number]
+            self._fits[ordered, number] = solve_normal(normal, np.array(ordered), **self._prior)
         values, covariance = self._fits[ordered, number]
         if ordered == tuple(used):
             return values, covariance
         places = np.searchsorted(ordered, used)
         return values[places], covariance[np.ix_(places, places)]
+
+    def loss(self, used: Sequence[int]) -> float:
+        """Return the loss of the best fit to all rows."""
+        ordered = tuple(sorted(used))
+        if ordered not in self._losses:
+            self._losses[ordered] = self._loss(ordered)
+        return self._losses[ordered]
+
+    def heldout(self, used: Sequence[int]) -> float:
+        """Return the loss of each fold under the fit to the other folds, summed."""
+        key = ('held out', *sorted(used))
+        if key not in self._losses:
+            self._losses[key] = self._heldout(tuple(sorted(used)))
+        return self._losses[key]
+
+    def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
+        """Return the loss on held-out data by sensor: of the windows' means and within the windows, of each axis, shape (2, 3)."""
+        raise NotImplementedError(f'{type(self).__name__} has no effect that acts on both sensors')
+
+    def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
+        """Return the p-value of `larger` against `smaller` (chi-square of the fall of the loss)."""
+        return float(chi2_sf(max(self.loss(smaller) - self.loss(larger), 0.0), len(larger) - len(smaller)))
+
+    def left_by_others(self, used: Sequence[int]) -> np.ndarray:
+        """Return the vectors that map rows of all parameters to residuals of the fit to all other folds, shape (n_folds, q + 1)."""
+        left = np.zeros((len(self.without), len(self.total)))
+        left[:, np.append(sorted(used), -1)] = self._left_by_others(tuple(sorted(used)))
+        return left
+
+    def _loss(self, used):
+        return quadratic(self.total, used, self.fit(used)[0])
+
+    def _heldout(self, used):
+        places, left = np.append(used, -1), self._left_by_others(used)
+        folds = self.total[np.ix_(places, places)] - self.without[:, places[:, None], places]
+        return float(np.einsum('fi,fij,fj->', left, folds, left))
+
+    def _left_by_others(self, used):
+        """Return for each fold the map from rows of `used`, sorted, to residuals of the fit to all other folds, shape (n_folds, n + 1)."""
+        if used not in self._predictions:
+            at, known = np.array(used), 1 / self._prior['prior_sd'][list(used)]**2
+            places = np.append(at, -1)
+            normal = self.without[:, places[:, None], places]
+            values = solve_scaled(normal[:, :-1, :-1] + np.diag(known), normal[:, :-1, -1] + known * self._prior['prior_mean'][at])
+            self._predictions[used] = np.pad(-values, ((0, 0), (0, 1)), constant_values=1.0)
+        return self._predictions[used]
 
 
 class WindowEvidence(Evidence):
@@ -114,15 +149,15 @@ class WindowEvidence(Evidence):
 
     def __init__(self, space: ParameterSpace, noise: dict[str, NoiseModel], fold: np.ndarray, *,
                  scatter: dict[str, np.ndarray] | None = None):
-        super().__init__(space.prior_sd, space.prior_mean)
         self.space, self.noise, self.fold = space, noise, fold
         self._white = {sensor: white_means(space, noise, sensor, scatter=(scatter or {}).get(sensor)) for sensor in SENSORS}
         folds = [fold == number for number in range(fold.max() + 1)]
         self._of_axis = {sensor: [np.array([[rows[own].T @ rows[own] for own in folds],
                                             [within_of_axis(space, noise[sensor], sensor, axis=axis, select=own) for own in folds]])
                                   for axis, rows in enumerate(self._white[sensor])] for sensor in SENSORS}
-        self._parts = np.sum([self._of_sensor(sensor) for sensor in SENSORS], axis=0)
-        self.total = np.sum(self._parts, axis=0)
+        parts = np.sum([self._of_sensor(sensor) for sensor in SENSORS], axis=0)
+        total = np.sum(parts, axis=0)
+        super().__init__(total, total - parts, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
 
     def _of_sensor(self, sensor):
         """Return the normal matrices of one sensor, of each fold."""
@@ -138,33 +173,9 @@ class WindowEvidence(Evidence):
         information = self._of_sensor(sensor).sum(axis=0)[at]
         return inverse_normal(information + np.diag(1 / self._prior['prior_sd'][list(used)]**2))
 
-    def normal(self, number: int | None = None) -> np.ndarray:
-        """Return the normal matrix of the chosen windows, or of all but fold `number`."""
-        return self.total if number is None else self.total - self._parts[number]
-
-    def equations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (matrix, right side) of the normal equations of all parameters on all chosen windows, with the prior."""
-        known = 1 / self._prior['prior_sd']**2
-        return self.total[:-1, :-1] + np.diag(known), self.total[:-1, -1] + known * self._prior['prior_mean']
-
-    def loss(self, used: Sequence[int]) -> float:
-        """Return the loss of the best fit on all chosen windows."""
-        ordered = tuple(sorted(used))
-        if ordered not in self._losses:
-            self._losses[ordered] = quadratic(self.total, ordered, self.fit(ordered)[0])
-        return self._losses[ordered]
-
-    def heldout(self, used: Sequence[int]) -> float:
-        """Return the loss of each fold under the fit to the other folds, summed."""
-        key = ('held out', *sorted(used))
-        if key not in self._losses:
-            places, left = np.append(sorted(used), -1), self._left_by_others(tuple(sorted(used)))
-            self._losses[key] = float(sum(own @ part[np.ix_(places, places)] @ own for own, part in zip(left, self._parts)))
-        return self._losses[key]
-
     def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
-        """Return the same loss by sensor: of the windows' means and within the windows, of each axis, shape (2, 3)."""
-        left = self._left_of_all(used)
+        """Return the loss of `heldout` by sensor: of the windows' means and within the windows, of each axis, shape (2, 3)."""
+        left = self.left_by_others(used)
         return {sensor: np.stack([_squares(parts, left[:, self.space.places(sensor, axis)]) for axis, parts in enumerate(axes)], axis=1)
                 for sensor, axes in self._of_axis.items()}
 
@@ -175,8 +186,8 @@ class WindowEvidence(Evidence):
         A slow bias process is correlated over folds: without this, the loss of a fold includes the uncertainty of the fit to
         the other folds. The effect of a drift within windows, which does not determine it, is predicted too.
         """
-        left, own, found = self._left_of_all(used), np.array(sorted(used)), self.heldout_parts(used)
-        others = (self.total - self._parts)[:, own[:, None], own] + np.diag(1 / self._prior['prior_sd'][own]**2)
+        left, own, found = self.left_by_others(used), np.array(sorted(used)), self.heldout_parts(used)
+        others = self.without[:, own[:, None], own] + np.diag(1 / self._prior['prior_sd'][own]**2)
         for sensor, axes in self._of_axis.items():
             for axis, (means, _) in enumerate(axes):
                 places = self.space.places(sensor, axis)
@@ -194,27 +205,6 @@ class WindowEvidence(Evidence):
         whole, folds = replace(self.space, join_within=self.space.join), [self.fold == number for number in range(self.fold.max() + 1)]
         return {sensor: [np.array([[within_of_axis(whole, self.noise[sensor], sensor, axis=axis, select=own) for own in folds]])
                          for axis in range(3)] for sensor in SENSORS}
-
-    def _left_of_all(self, used):
-        """Return the vectors that map rows of all parameters to residuals of the fit to all other folds, shape (k, q + 1)."""
-        left = np.zeros((len(self._parts), self.space.size + 1))
-        left[:, np.append(sorted(used), -1)] = self._left_by_others(tuple(sorted(used)))
-        return left
-
-    def _left_by_others(self, used):
-        """Return for each fold the map from rows of `used`, sorted, to residuals of the fit to all other folds, shape (k, n + 1)."""
-        if used not in self._predictions:
-            at, known = np.array(used), 1 / self._prior['prior_sd'][list(used)]**2
-            places = np.append(at, -1)
-            normal = self.total[np.ix_(places, places)] - np.asarray(self._parts)[:, places[:, None], places]
-            values = solve_scaled(normal[:, :-1, :-1] + np.diag(known), normal[:, :-1, -1] + known * self._prior['prior_mean'][at])
-            self._predictions[used] = np.pad(-values, ((0, 0), (0, 1)), constant_values=1.0)
-        return self._predictions[used]
-
-    def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
-        """Return the p-value of `larger` against `smaller` (chi-square of the fall of the loss)."""
-        fall = self.loss(smaller) - self.loss(larger)
-        return float(chi2_sf(max(fall, 0.0), len(larger) - len(smaller)))
 
     def p_value_by_scatter(self, used: Sequence[int], parameters: Sequence[int]) -> float:
         """

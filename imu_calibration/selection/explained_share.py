@@ -1,6 +1,6 @@
 """Share of the excess over noise that the chosen effects remove; prevents findings that stand in for a cause outside the catalogue."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -25,59 +25,49 @@ ONE_OF_THREE = 6.0 / 5.0
 
 class Explained:
     """
-    Loss on held-out windows: the expectation from noise, and the loss of a choice of effects.
-
-    The noise here has no window offsets, and the estimated bias process up to a plausible size. A window that scatters more within than
-    its kind has a less certain mean: one turn about two fast axes among many slow ones.
+    Excess over noise on held-out data, and the share of it that effects remove.
 
     Parameters
     ----------
-    evidence : WindowEvidence
     search : Search
+    losses : callable
+        Returns for parameters in use: sensor -> squares on held-out data in units of their noise, shape (n_parts, n_axes).
+    numbers : dict
+        Sensor -> number of squares of each part, their expectation from noise, shape (n_parts,).
+    least_part : float
+        Share of its largest removal with which an effect counts in a part; minus infinity: in all parts.
 
     """
 
-    def __init__(self, evidence: WindowEvidence, search: Search):
-        self.search, recording = search, evidence.space.recording
-        duration = float(np.ptp(recording.time))
-        noise = {sensor: own.at_rest_only(*plausible_processes(own, recording.period, sensor=sensor, duration=duration))
-                 for sensor, own in evidence.noise.items()}
-        every = range(evidence.space.size)
-        scatter = scatter_of_each(evidence.space, evidence.noise, evidence.fit(every)[0])
-        self.floor = WindowEvidence(evidence.space, noise, evidence.fold, scatter=scatter)
-        self.n_means = 3.0 * len(recording.windows)
-        self.n_within = 3.0 * (recording.count - 1)[recording.moving].sum()
+    def __init__(self, search: Search, losses: Callable, numbers: Mapping[str, np.ndarray], *, least_part: float = SHOWS):
+        self.search, self.losses, self.numbers, self.least_part = search, losses, numbers, least_part
 
     def excess(self, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
-        """Return sensor -> excess of each axis, of the means and within windows: held-out loss minus its expectation from noise, (2, 3)."""
-        losses = self.floor.unpredicted(self.search.used(chosen))
-        return {sensor: parts - self._numbers[:, None] / 3.0 for sensor, parts in losses.items()}
+        """Return sensor -> held-out loss minus its expectation from noise, of each part and axis, shape (n_parts, n_axes)."""
+        losses = self.losses(self.search.used(chosen))
+        return {sensor: parts - self.numbers[sensor][:, None] / parts.shape[1] for sensor, parts in losses.items()}
 
-    @property
-    def _numbers(self):
-        return np.array([self.n_means, self.n_within])
-
-    def sigma(self, excess: np.ndarray) -> np.ndarray:
+    def sigma(self, sensor: str, excess: np.ndarray) -> np.ndarray:
         """
-        Return the excess over noise in standard deviations, of the means and within windows, shape (2,).
+        Return the excess over noise of each part in standard deviations, shape (n_parts,).
 
         The larger one of all axes together and of the worst axis, with a stricter limit: two quiet axes dilute the excess of the third.
         """
-        together, alone = self._sigmas(excess)
+        together, alone = self._sigmas(sensor, excess)
         return np.maximum(together, alone.max(axis=1))
 
-    def _sigmas(self, excess):
-        """Return the same of all axes together, shape (2,), and of each axis, shape (2, 3)."""
-        sd = np.sqrt(2 * np.maximum(self._numbers, 1.0))
-        return excess.sum(axis=1) / sd, excess / (sd / np.sqrt(3.0) * ONE_OF_THREE)[:, None]
+    def _sigmas(self, sensor, excess):
+        """Return the same of all axes together, shape (n_parts,), and of each axis, shape (n_parts, n_axes)."""
+        sd = np.sqrt(2 * np.maximum(self.numbers[sensor], 1.0))
+        return excess.sum(axis=1) / sd, excess / (sd / np.sqrt(excess.shape[1]) * ONE_OF_THREE)[:, None]
 
-    def rest(self, excess: np.ndarray) -> float:
-        """Return the part of an excess that noise does not explain: zero where it is not significant."""
-        return float(sum(self._rest(excess)))
+    def rest(self, chosen: Sequence[Question]) -> float:
+        """Return the excess that noise does not explain, of all sensors and parts in which it is significant."""
+        return float(sum(self._rest(sensor, excess).sum() for sensor, excess in self.excess(chosen).items()))
 
-    def _rest(self, excess):
-        """Return the same of the means and within windows, shape (2,)."""
-        together, alone = self._sigmas(excess)
+    def _rest(self, sensor, excess):
+        """Return the same of each part, shape (n_parts,)."""
+        together, alone = self._sigmas(sensor, excess)
         left = np.where(alone > SIGNIFICANT_REST, excess, 0.0).sum(axis=1)
         return np.where(together > SIGNIFICANT_REST, np.maximum(excess.sum(axis=1), left), left)
 
@@ -101,8 +91,34 @@ class Explained:
         strongest = max(parts.sum() for parts in removed.values())
         # A cause in the table acts on both sensors; a sensor with a weak signal is no evidence.
         sensors = [s for s, parts in removed.items() if parts.sum() >= SHOWS * strongest > 0]
-        shown = {s: removed[s] >= SHOWS * removed[s].max() for s in sensors}
-        return [(float(removed[s][shown[s]].sum()), float(self._rest(with_it[s])[shown[s]].sum())) for s in sensors]
+        shown = {s: removed[s] >= self.least_part * removed[s].max() for s in sensors}
+        return [(float(removed[s][shown[s]].sum()), float(self._rest(s, with_it[s])[shown[s]].sum())) for s in sensors]
+
+
+class ExplainedWindows(Explained):
+    """
+    The same on the windows of a table.
+
+    The noise here has no window offsets, and the estimated bias process up to a plausible size. A window that scatters more within than
+    its kind has a less certain mean: one turn about two fast axes among many slow ones.
+
+    Parameters
+    ----------
+    evidence : WindowEvidence
+    search : Search
+
+    """
+
+    def __init__(self, evidence: WindowEvidence, search: Search):
+        recording = evidence.space.recording
+        duration = float(np.ptp(recording.time))
+        noise = {sensor: own.at_rest_only(*plausible_processes(own, recording.period, sensor=sensor, duration=duration))
+                 for sensor, own in evidence.noise.items()}
+        every = range(evidence.space.size)
+        scatter = scatter_of_each(evidence.space, evidence.noise, evidence.fit(every)[0])
+        self.floor = WindowEvidence(evidence.space, noise, evidence.fold, scatter=scatter)
+        self.n_means, self.n_within = 3.0 * len(recording.windows), 3.0 * (recording.count - 1)[recording.moving].sum()
+        super().__init__(search, self.floor.unpredicted, dict.fromkeys(SENSORS, np.array([self.n_means, self.n_within])))
 
 
 def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:

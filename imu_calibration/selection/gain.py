@@ -65,7 +65,7 @@ def heldout_gain(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
     told = gain_in_turn(attempt, before, after, sensors=sensors)
     used = map(attempt.search.used, (before, after))
     values = [attempt.space.reduced(some, attempt.evidence.fit(some)[0])[None] for some in used]
-    return _gain(told.sensor, told.measure, [_squares(attempt.locked_samples, each, told.sensor)[told.measure] for each in values])
+    return gain_of(told.sensor, told.measure, [_squares(attempt.locked_samples, each, told.sensor)[told.measure] for each in values])
 
 
 def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
@@ -82,14 +82,15 @@ def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
             values = np.array([attempt.space.reduced(used, attempt.evidence.fit(used, number)[0]) for number in range(fold.max() + 1)])
             pair.append(_squares(attempt.all_samples, values[fold], sensor))
         of = {measure: [squares[measure] for squares in pair] for measure in MEASURES}
-        found += [(_gain(sensor, measure, each), _certainty(each)) for measure, each in of.items()]
+        found += [(gain_of(sensor, measure, each), _certainty(each)) for measure, each in of.items()]
     most = max((told for told, _ in found if told.measure != AT_REST), key=lambda told: told.least)
     if most.least > 0:
         return most
     return max(found, key=lambda entry: (not np.isinf(entry[0].least), entry[1]))[0]
 
 
-def _gain(sensor, measure, pair):
+def gain_of(sensor: str, measure: str, pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> Gain:
+    """Return the Gain from (sums of squares, numbers) of each group of rows, before and after."""
     return Gain(sensor, measure, *(_rms(*entry) for entry in pair), reduction_interval(pair), len(pair[0][0]))
 
 

@@ -13,7 +13,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import LEAST_WINDOWS
-from imu_calibration.selection.explained_share import Explained, pruned, sensors_of
+from imu_calibration.selection.explained_share import ExplainedWindows, pruned, sensors_of
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.lag_explanations import lag_explanations
 from imu_calibration.selection.onset import Onset, find_onset
@@ -38,7 +38,7 @@ class Investigation(Named):
     """Windows that were fitted to, without clipped samples."""
     attempt: Attempt
     """The last linearisation with its evidence."""
-    explained: Explained
+    explained: ExplainedWindows
     """Expected loss from noise and losses of choices."""
     named: Sequence[Question]
     """Questions that became findings, in the order found."""
@@ -144,7 +144,7 @@ class _Outcome:
     """Result of a choice."""
 
     attempt: Attempt
-    explained: Explained
+    explained: ExplainedWindows
     chosen: Sequence[Question]
     named: Sequence[Question]
     denied: Sequence[Question]
@@ -152,7 +152,7 @@ class _Outcome:
     @cached_property
     def rest(self):
         """Significant excess over noise with the findings in the model."""
-        return sum(map(self.explained.rest, self.explained.excess(self.named).values()))
+        return self.explained.rest(self.named)
 
 
 def _with_lags(explanations, attempted):
@@ -207,14 +207,14 @@ def _settled(attempted, attempt, chosen, progress=None):
         chosen = _searched(attempt, chosen)
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
-    explained = Explained(attempt.evidence, attempt.search)
+    explained = ExplainedWindows(attempt.evidence, attempt.search)
     first = simpler(attempt, explained, pruned(chosen, explained.share))
     named, denied = _agreed(attempt, explained, _that_help(attempt, explained, first))
     for _ in range(LINEARISATIONS - 1):
         if not attempt.acts_beside(named):
             break
         attempt = attempted(point=attempt.point(named))
-        explained = Explained(attempt.evidence, attempt.search)
+        explained = ExplainedWindows(attempt.evidence, attempt.search)
         again, denied, chosen = (same_questions(attempt, some) for some in (named, denied, chosen))
         named = _that_help(attempt, explained, pruned(again, explained.share))
     return _Outcome(attempt, explained, chosen, named, denied)

@@ -10,7 +10,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import LEAST_WINDOWS
-from imu_calibration.selection.explained_share import LEAST_SHARE, SIGNIFICANT_REST, Explained
+from imu_calibration.selection.explained_share import LEAST_SHARE, SIGNIFICANT_REST, ExplainedWindows
 from imu_calibration.selection.normal_matrices import matrix_of_each
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_blocks import residuals
@@ -49,7 +49,7 @@ class Onset:
                                for name, value in self.before.items()}}
 
 
-def find_onset(attempt: Attempt, explained: Explained, chosen: Sequence[Question], *, windows: Sequence[Window],
+def find_onset(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Question], *, windows: Sequence[Window],
                table: Table) -> Onset | None:
     """
     Return the Onset that explains the residual of a choice, None without one.

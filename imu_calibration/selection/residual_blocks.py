@@ -15,7 +15,7 @@ from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, chunks
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.explained_share import Explained
+from imu_calibration.selection.explained_share import ExplainedWindows
 from imu_calibration.selection.noise_beside_effects import natural_processes
 from imu_calibration.selection.questions import TEMPERATURE_SPAN
 from imu_calibration.simulation.session import predict_windows
@@ -92,7 +92,7 @@ class BlockWhitener:
         return solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False)
 
 
-def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, explained: Explained) -> dict[str, RestBlocks]:
+def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, explained: ExplainedWindows) -> dict[str, RestBlocks]:
     """
     Return sensor -> RestBlocks of the windows that an attempt reduced.
 
@@ -103,7 +103,7 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
     table : Table
     attempt : Attempt
         The linearisation of the columns.
-    explained : Explained
+    explained : ExplainedWindows
         Expected loss from noise.
 
     """

@@ -137,6 +137,13 @@ class Search:
         places = [used.index(k) for k in question.parameters]
         return values[places], np.sqrt(np.diag(covariance)[places])
 
+    def moved_by(self, chosen: Sequence[Question], question: Question, names: Sequence[str]) -> dict[str, float]:
+        """Return parameter -> its change, of the baseline and of the other choices among `names`, when an effect joins them."""
+        others = [q for q in chosen if q is not question]
+        smaller, larger = self.used(others), self.used([*others, question])
+        moved = self.evidence.fit(larger)[0][:len(smaller)] - self.evidence.fit(smaller)[0]
+        return {names[k]: float(change) for k, change in zip(smaller, moved) if k < len(names)}
+
     def shows_alike(self, chosen: Sequence[Question], question: Question) -> bool:
         """
         Return whether no sensor on which an effect acts is predicted worse with it.

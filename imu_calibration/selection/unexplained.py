@@ -10,7 +10,7 @@ from imu_calibration.core.distributions import f_sf
 from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.explained_share import Explained
+from imu_calibration.selection.explained_share import ExplainedWindows
 from imu_calibration.selection.questions import Question
 
 SIGNIFICANT = 5.0
@@ -53,7 +53,7 @@ class Unexplained:
     """Fixed frequencies and fixed multiples of a joint's speed in it (`Tone`), the surest first."""
 
 
-def unexplained(attempt: Attempt, explained: Explained, chosen: Sequence[Question]) -> dict[str, Unexplained]:
+def unexplained(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Question]) -> dict[str, Unexplained]:
     """Return sensor -> Unexplained for a choice of effects."""
     excess, used = explained.excess(chosen), attempt.search.used(chosen)
     values = attempt.space.reduced(used, attempt.evidence.fit(used)[0])
@@ -82,7 +82,7 @@ def _rest(attempt, explained, sensor, excess, values):
     floor = explained.floor.noise[sensor]
     white = floor.variance_beside_bias(recording.kind, recording.count, recording.duration, keys=recording.keys)
     noise_sd = np.sqrt(white + floor.bias_variance)
-    sigma_means, sigma_within = explained.sigma(excess)
+    sigma_means, sigma_within = explained.sigma(sensor, excess)
     # Quiet axes dilute the excess of one.
     means, within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
     sigma = max(sigma_means, sigma_within) if within > WITHIN_SHARE * explained.n_within else sigma_means

@@ -7,7 +7,7 @@ import pytest
 
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.selection import investigation
-from imu_calibration.selection.evidence import Evidence, WindowEvidence
+from imu_calibration.selection.evidence import Evidence
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.rivals import _Blocks, best_pairs
 from imu_calibration.selection.search import PENALTY, Search
@@ -23,11 +23,8 @@ def searched(signal, alike, size=1e-6):
     columns = rng.normal(size=(N_ROWS, 5))
     columns[:, 2] = alike * columns[:, 1] + np.sqrt(1 - alike**2) * columns[:, 2] + 0.5 * columns[:, 0]
     rows = np.column_stack([columns / size, columns @ np.asarray(signal, float) + rng.normal(size=N_ROWS)])
-    evidence = WindowEvidence.__new__(WindowEvidence)
-    Evidence.__init__(evidence, np.full(5, 1e3), np.zeros(5))
-    evidence._parts = [part.T @ part for part in np.split(rows, 6)]
-    evidence.total = sum(evidence._parts)
-    return Search(evidence, (0,), ASKED)
+    total, parts = rows.T @ rows, np.array([part.T @ part for part in np.split(rows, 6)])
+    return Search(Evidence(total, total - parts, prior_sd=np.full(5, 1e3), prior_mean=np.zeros(5)), (0,), ASKED)
 
 
 def names(choice):

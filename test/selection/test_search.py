@@ -16,7 +16,7 @@ from imu_calibration.selection import unexplained as rests
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.bias_process_search import BiasProcessSearch
 from imu_calibration.selection.evidence import Evidence, WindowEvidence, folds_of, locked_windows
-from imu_calibration.selection.explained_share import Explained, pruned
+from imu_calibration.selection.explained_share import SHOWS, Explained, ExplainedWindows, pruned
 from imu_calibration.selection.noise_beside_effects import _needed_smooth, drift_prior, natural_processes, plausible_processes
 from imu_calibration.selection.normal_matrices import scatter_of_each, white_means
 from imu_calibration.selection.parameter_space import ParameterSpace, parameter_space
@@ -39,11 +39,8 @@ class Known(Evidence):
     """Evidence that is given: losses of choices, an estimate, a p-value."""
 
     def __init__(self, loss=dict, values=None, p=1e-12):
-        super().__init__(np.ones(9), np.zeros(9))
+        super().__init__(np.zeros((10, 10)), np.zeros((0, 10, 10)), prior_sd=np.ones(9), prior_mean=np.zeros(9))
         self.loss_of, self.values, self.p = loss, values, p
-
-    def normal(self, number=None):
-        raise NotImplementedError
 
     def loss(self, used):
         return self.loss_of(frozenset(used))
@@ -107,10 +104,9 @@ def test_noise_gains_nothing_where_it_was_not_fitted():
     """Columns of noise fit the windows that they see, and predict others worse than one column does: on average of forty draws."""
     gained = []
     for seed in range(40):
-        evidence = WindowEvidence.__new__(WindowEvidence)
-        Evidence.__init__(evidence, np.full(4, 1e3), np.zeros(4))
-        evidence._parts = [rows.T @ rows for rows in np.random.default_rng(seed).normal(size=(6, 6, 5))]
-        evidence.total = sum(evidence._parts)
+        parts = np.array([rows.T @ rows for rows in np.random.default_rng(seed).normal(size=(6, 6, 5))])
+        total = parts.sum(axis=0)
+        evidence = Evidence(total, total - parts, prior_sd=np.full(4, 1e3), prior_mean=np.zeros(4))
         gained.append((evidence.loss([0]) - evidence.loss(range(4)), evidence.heldout([0]) - evidence.heldout(range(4))))
     fitted, held_out = np.mean(gained, axis=0)
     assert fitted > 2.0 and held_out < -2.0
@@ -196,7 +192,7 @@ def test_what_leaves_most_unexplained_is_not_named(question, share, kept):
 def test_a_cause_of_the_table_shows_in_both_sensors():
     """It takes all there is off the accelerometer, and leaves twice as much on the gyroscope as it takes."""
     explained = Explained.__new__(Explained)
-    explained.n_means, explained.n_within = 100.0, 1000.0
+    explained.numbers, explained.least_part = dict.fromkeys(SENSORS, np.array([100.0, 1000.0])), SHOWS
     explained.excess = lambda chosen: {'accelerometer': alike(0.0, 0.0), 'gyroscope': alike(2000.0, 0.0)} if chosen else {
         'accelerometer': alike(1000.0, 0.0), 'gyroscope': alike(3000.0, 0.0)}
     assert explained.share([OFFSET], OFFSET) == pytest.approx(1 / 3)
@@ -206,7 +202,7 @@ def test_a_cause_of_the_table_shows_in_both_sensors():
 def test_what_is_unexplained_where_an_effect_does_not_show_does_not_hide_it(within, share):
     """It explains the means; within windows, where it shows or does not, as much stays as it removes in all."""
     explained = Explained.__new__(Explained)
-    explained.n_means, explained.n_within = 100.0, 1000.0
+    explained.numbers, explained.least_part = dict.fromkeys(SENSORS, np.array([100.0, 1000.0])), SHOWS
     explained.excess = lambda chosen: {'accelerometer': alike(0.0, 1000.0 + within) if chosen else alike(1000.0, 1000.0 + 2 * within)}
     assert explained.share([QUADRATIC], QUADRATIC) == pytest.approx(share)
 
@@ -219,9 +215,10 @@ def alike(means, within):
 def test_what_one_axis_has_is_not_hidden_by_the_quiet_of_the_others():
     """All together are below five standard deviations, one alone is above six; three that share the same are not."""
     explained = Explained.__new__(Explained)
-    explained.n_means, explained.n_within = 300.0, 3000.0
+    explained.numbers, explained.least_part = {'accelerometer': np.array([300.0, 3000.0])}, SHOWS
     alone = np.array([[-20.0, 100.0, -20.0], [0.0, 0.0, 0.0]])
-    assert explained.sigma(alone)[0] > 5.0 and explained.rest(alone) == 100.0
+    explained.excess = lambda excess: {'accelerometer': excess}
+    assert explained.sigma('accelerometer', alone)[0] > 5.0 and explained.rest(alone) == 100.0
     assert explained.rest(alike(60.0, 0.0)) == explained.rest(np.array([[0.0, 80.0, 0.0], [0.0, 0.0, 0.0]])) == 0.0
     explained.excess = lambda chosen: {'accelerometer': alone if chosen else alone + np.array([[0.0, 300.0, 0.0], [0.0, 0.0, 0.0]])}
     assert explained.share([DRIFT], DRIFT) == pytest.approx(0.75), 'too little for an effect that is smooth in time'
@@ -371,12 +368,10 @@ def test_a_window_that_scatters_more_within_has_a_less_certain_mean():
 def test_what_only_one_window_tells_is_not_held_against_it():
     """The level of a bias that hardly forgets is known from the first window alone: held out, it is missed by what the others do not know."""
     rows = np.column_stack([[1.0, *[0.01] * 11], [50.0, *np.random.default_rng(0).normal(size=11)]])
-    evidence = WindowEvidence.__new__(WindowEvidence)
-    Evidence.__init__(evidence, np.full(1, 1e3), np.zeros(1))
-    evidence._parts = np.array([rows[k::6].T @ rows[k::6] for k in range(6)])
+    evidence, parts = WindowEvidence.__new__(WindowEvidence), np.array([rows[k::6].T @ rows[k::6] for k in range(6)])
+    Evidence.__init__(evidence, parts.sum(axis=0), parts.sum(axis=0) - parts, prior_sd=np.full(1, 1e3), prior_mean=np.zeros(1))
     evidence.space = SimpleNamespace(size=1, places=lambda sensor, axis: np.array([0, 1]))
-    evidence._of_axis, evidence.total = {'gyroscope': [np.stack([evidence._parts, 0 * evidence._parts])]}, evidence._parts.sum(axis=0)
-    evidence._within_whole = {'gyroscope': [0 * evidence._parts[None]]}
+    evidence._of_axis, evidence._within_whole = {'gyroscope': [np.stack([parts, 0 * parts])]}, {'gyroscope': [0 * parts[None]]}
     assert evidence.heldout([0]) > 500.0
     assert evidence.unpredicted([0])['gyroscope'][0, 0] < 30.0
 
@@ -493,9 +488,10 @@ def rest_of(sigma, residual):
                                 describe={'time': np.arange(float(count)), 'temperature': np.full(count, np.nan), 'rate': np.zeros(count),
                                           'specific force': np.full(count, 9.8)})
     space = SimpleNamespace(mean={'accelerometer': [column[:, None] for column in residual.T]}, recording=recording, places=lambda sensor, axis: np.array([0]))
-    explained = Explained.__new__(Explained)
+    explained = ExplainedWindows.__new__(ExplainedWindows)
     explained.floor = SimpleNamespace(noise={'accelerometer': NoiseModel(np.full(3, 100.0), np.ones(3))})
     explained.n_means, explained.n_within = 3.0 * count, 0.0
+    explained.numbers = {'accelerometer': np.array([3.0 * count, 0.0])}
     return rests._rest(SimpleNamespace(space=space, recording=recording), explained, 'accelerometer', alike(sigma * np.sqrt(6.0 * count), 0.0), np.ones(1))
 
 

@@ -185,8 +185,8 @@ def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
     def gain_of(place):
         return found.gain(named[:place], named[:place + 1], named[place].sensor)
 
-    findings = tuple(finding(inquiry.search, named, place, solution=after, share=inquiry.share, gain_of=gain_of, motion_of=motions_of)
-                     for place in range(len(named)))
+    findings = tuple(finding(inquiry.search, named, place, solution=after, share=inquiry.explained.share, gain_of=gain_of,
+                             motion_of=motions_of) for place in range(len(named)))
     gain = found.gain([], named, named[0].sensor) if named else None
     count = len(found.baseline.poses.start)
     return Diagnosis(findings, {s: rest_of(found.baseline, inquiry, named, sensor=s) for s in SENSORS},

@@ -120,7 +120,7 @@ def _rivals(found, question):
     values = dict(zip(found.attempt.space.names, found.attempt.values(found.named)))
     own = [found.attempt.space.names[k] for k in question.parameters]
     for other in found.doubtful:
-        moved = found.attempt.moved_by(found.named, other)
+        moved = found.search.moved_by(found.named, other, found.attempt.space.names)
         near += [other] if any(abs(moved.get(name, 0.0)) > HALF * abs(values[name]) for name in own) else []
     return near
 

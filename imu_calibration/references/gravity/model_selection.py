@@ -15,8 +15,8 @@ from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.hand_parameters import possible_by_hand
 from imu_calibration.references.gravity.pose_evidence import HandEvidence
 from imu_calibration.selection.evidence import agree
-from imu_calibration.selection.explained_share import SIGNIFICANT_REST, pruned
-from imu_calibration.selection.gain import Gain, reduction_interval
+from imu_calibration.selection.explained_share import Explained, pruned
+from imu_calibration.selection.gain import Gain, gain_of
 from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
 from imu_calibration.selection.search import Named, Search
 
@@ -36,6 +36,7 @@ class Inquiry:
         self.blocks, self.space, self.questions = blocks, space, questions
         self.evidence = HandEvidence(blocks, space, smooth, baseline=baseline)
         self.search = Search(self.evidence, baseline, questions)
+        self.explained = Explained(self.search, self.evidence.against_noise, self.evidence.numbers, least_part=-np.inf)
 
     def without(self, poses: np.ndarray) -> 'Inquiry':
         """Return the same inquiry without some poses."""
@@ -51,29 +52,15 @@ class Inquiry:
 
         Sizes beyond the range of known instruments are tested only for the remaining excess.
         """
-        named = list(pruned(self.search.run(), self.share))
-        if self.rest(named):
+        named = list(pruned(self.search.run(), self.explained.share))
+        if self.explained.rest(named):
             wide = Search(self.evidence, self.search.baseline, self.questions, any_size=True)
             known, self.search = self.search, wide
-            others = list(pruned(wide.run(), self.share))
-            if self.rest(others) < self.rest(named):
+            others = list(pruned(wide.run(), self.explained.share))
+            if self.explained.rest(others) < self.explained.rest(named):
                 return others
             self.search = known
         return named
-
-    def rest(self, chosen: Sequence[Question], sensor: str | None = None) -> float:
-        """Return the significant excess over noise of a choice in held-out poses, of one sensor or of both."""
-        left = self.evidence.heldout_residuals(self.search.used(chosen))
-        excess = [(np.sum(new**2 / block.floor) - new.size, new.size)
-                  for block, new in zip(self.blocks, left) if sensor in (None, block.sensor)]
-        return sum(value for value, size in excess if value > SIGNIFICANT_REST * np.sqrt(2 * size))
-
-    def share(self, chosen: Sequence[Question], question: Question) -> float:
-        """Return the share of the excess over noise in held-out poses that the effect removes from its sensor."""
-        after, before = (self.evidence.heldout_residuals(self.search.used(c)) for c in (chosen, [q for q in chosen if q is not question]))
-        removed = sum(np.sum((old**2 - new**2) / block.floor)
-                      for block, new, old in zip(self.blocks, after, before) if block.sensor == question.sensor)
-        return removed / (removed + self.rest(chosen, question.sensor)) if removed > 0 else 0.0
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """
@@ -129,15 +116,6 @@ class HandInvestigation(Named):
                 amplitude = [values[used.index(k)] for k in question.parameters]
                 point[question.name] = np.array([*amplitude, self.constants[int(question.label.split('@')[1])]])
         return point
-
-    def moved_by(self, question: Question) -> dict[str, float]:
-        """Return baseline parameter -> its change when an effect is added to the findings."""
-        search, evidence = self.inquiry.search, self.inquiry.evidence
-        others = [q for q in self.named if q is not question]
-        smaller, larger = search.used(others), search.used([*others, question])
-        moved = evidence.fit(larger)[0][:len(smaller)] - evidence.fit(smaller)[0]
-        names = self.baseline.model.param_names
-        return {names[k]: float(change) for k, change in zip(smaller, moved) if k < len(names)}
 
     def gain(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Gain:
         """Return the Gain of one choice over another on poses held out from both fit and choice."""
@@ -276,16 +254,9 @@ def _gain(inquiry, held_out, before, after, sensor):
     """Return the Gain of one choice over another on poses held out from both fit and choice."""
     pair = [_predicted(inquiry, held_out, {q.name for q in choice}) for choice in (before, after)]
     inside = [inquiry.evidence.heldout_residuals(inquiry.search.used(choice)) for choice in (before, after)]
-    best = None
-    for k, block in enumerate(inquiry.blocks):
-        if block.sensor != sensor:
-            continue
-        fall = np.sum(inside[1][k]**2) / max(np.sum(inside[0][k]**2), 1e-300)
-        if best is None or fall < best[0]:
-            best = (fall, k)
-    block = inquiry.blocks[best[1]]
-    poses = np.unique(block.pose)
-    sums = [(np.array([np.sum(p[best[1]][block.pose == pose]**2) for pose in poses]),
-             np.array([block.known[block.pose == pose].size for pose in poses], float)) for p in pair]
-    rms = [float(np.sqrt(squares.sum() / number.sum())) for squares, number in sums]
-    return Gain(sensor, block.name, rms[0], rms[1], reduction_interval(sums), len(poses))
+    own = [k for k, block in enumerate(inquiry.blocks) if block.sensor == sensor]
+    best = min(own, key=lambda k: np.sum(inside[1][k]**2) / max(np.sum(inside[0][k]**2), 1e-300))
+    block = inquiry.blocks[best]
+    place = np.unique(block.pose, return_inverse=True)[1]
+    numbers = np.bincount(place) * block.known.shape[1]
+    return gain_of(sensor, block.name, [(np.bincount(place, (residuals[best]**2).sum(axis=1)), numbers) for residuals in pair])

@@ -1,11 +1,11 @@
 """Evidence from a recording without a table: few poses, so that variances are estimated too and every pose is held out in turn."""
 
 from collections.abc import Sequence
-from functools import cached_property
 
 import numpy as np
 
 from imu_calibration.core.distributions import f_sf
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.estimation.noise_search import NoiseLikelihood
 from imu_calibration.estimation.whitening import Whitening
@@ -45,13 +45,14 @@ class HandEvidence(Evidence):
     """
 
     def __init__(self, blocks: Sequence[Block], space: HandSpace, smooth: Sequence[int], *, baseline: Sequence[int]):
-        super().__init__(space.prior_sd, np.zeros(space.size))
         self.blocks, self.space = blocks, space
         self._noise = [_noise(block, [*baseline, *(k for k in smooth if np.any(block.rows[:, :, k]))]) for block in blocks]
         poses = np.unique(np.concatenate([block.pose for block in blocks]))
-        self.n_folds = len(poses) if len(poses) <= ONE_BY_ONE else FOLDS
-        place = {pose: k % self.n_folds for k, pose in enumerate(poses)}
-        self.folds = [np.array([place[pose] for pose in block.pose]) for block in blocks]
+        n_folds = len(poses) if len(poses) <= ONE_BY_ONE else FOLDS
+        self.folds = [np.searchsorted(poses, block.pose) % n_folds for block in blocks]
+        self._white = self._whitened()
+        total, *without = (sum(rows.T @ rows for rows in white) for white in (self._white, *map(self._whitened, range(n_folds))))
+        super().__init__(total, np.array(without), prior_sd=space.prior_sd, prior_mean=np.zeros(space.size))
 
     def _whitened(self, number=None):
         """Return the rows of each block, without fold `number`, as independent rows of unit variance, a list of (m, q + 1)."""
@@ -62,19 +63,6 @@ class HandEvidence(Evidence):
             white.append(whitening(block.rows[kept]).reshape(-1, self.space.size + 1))
         return white
 
-    @cached_property
-    def _white(self):
-        return self._whitened()
-
-    @cached_property
-    def _normals(self):
-        return {number: sum(rows.T @ rows for rows in (self._white if number is None else self._whitened(number)))
-                for number in (None, *range(self.n_folds))}
-
-    def normal(self, number: int | None = None) -> np.ndarray:
-        """Return the normal matrix of all rows, or of the rows outside fold `number`, whitened without it."""
-        return self._normals[number]
-
     def residuals(self, used: Sequence[int]) -> list[np.ndarray]:
         """Return the residual rows of each block under the fit to all poses, shape (m, n_axes)."""
         values = self.fit(used)[0]
@@ -82,21 +70,26 @@ class HandEvidence(Evidence):
 
     def heldout_residuals(self, used: Sequence[int]) -> list[np.ndarray]:
         """Return the residual of every row under the fit without its pose, shape (m, n_axes) per block."""
-        values, index = np.array([self.fit(used, number)[0] for number in range(self.n_folds)]), list(used)
-        return [b.rows[:, :, -1] - np.einsum('map,mp->ma', b.rows[:, :, index], values[fold]) for b, fold in zip(self.blocks, self.folds)]
+        left = self.left_by_others(used)
+        return [np.einsum('mac,mc->ma', block.rows, left[fold]) for block, fold in zip(self.blocks, self.folds)]
 
-    def heldout(self, used: Sequence[int]) -> float:
-        """Return the loss of all poses when each is held out in turn; cached, because a search repeats choices for each effect."""
-        ordered = tuple(sorted(used))
-        key = ('held out', *ordered)
-        if key not in self._losses:
-            squares = [r**2 / (variance + sum(process.sd**2 for process in processes))
-                       for r, (variance, processes) in zip(self.heldout_residuals(ordered), self._noise)]
-            self._losses[key] = float(sum(s.size * np.log(s.mean()) for s in squares))
-        return self._losses[key]
+    def against_noise(self, used: Sequence[int]) -> dict[str, np.ndarray]:
+        """Return sensor -> squares of the same in units of noise and usual bias drift, of each block, shape (n_blocks, 1)."""
+        left = self.heldout_residuals(used)
+        return {sensor: np.array([[np.sum(r**2 / block.floor)] for block, r in zip(self.blocks, left) if block.sensor == sensor])
+                for sensor in SENSORS}
 
-    def loss(self, used: Sequence[int]) -> float:
-        """Return the loss of the best fit to all poses."""
+    @property
+    def numbers(self) -> dict[str, np.ndarray]:
+        """Sensor -> number of the squares of each block."""
+        return {sensor: np.array([block.known.size for block in self.blocks if block.sensor == sensor]) for sensor in SENSORS}
+
+    def _heldout(self, used):
+        squares = [r**2 / (variance + sum(process.sd**2 for process in processes))
+                   for r, (variance, processes) in zip(self.heldout_residuals(used), self._noise)]
+        return float(sum(s.size * np.log(s.mean()) for s in squares))
+
+    def _loss(self, used):
         return float(sum(len(white) * np.log(np.mean(self._left(white, used)**2)) for white in self._white))
 
     def _left(self, white, used):
