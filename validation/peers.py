@@ -12,7 +12,6 @@ from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
-from imu_calibration.references.gravity.hand_parameters import unpack
 from imu_calibration.use_cases.calibrate import calibrate
 from validation.hand_peers import imu_calib, imu_tk, norm_fit, six_faces, turned
 from validation.second_opinions import Forward, fit_norm
@@ -100,6 +99,7 @@ def ours(calibration):
 
 def by_hand(make):
     """Return rms errors over the seeds of ours, the plain fit on means and on medians, shape (3, 2); inf where we refuse."""
+    from worlds.hand_sessions import unpack
     rows = []
     for seed in SEEDS:
         imu, ranges, values = make(seed)
@@ -115,6 +115,7 @@ def by_hand(make):
 
 def trial(make):
     """Return {method: median errors over the sessions of a trial}; None for a sensor that a method does not calibrate."""
+    from worlds.hand_sessions import unpack
     found = {}
     for seed in TRIAL_SEEDS:
         imu, ranges, values = make(seed)

@@ -18,7 +18,7 @@ from imu_calibration.estimation.status import LACKING
 from imu_calibration.references.gravity.equations import Poses
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_options import ByHandSettings
-from imu_calibration.references.gravity.hand_parameters import GYRO_BIAS, GYRO_MATRIX, HandModel, unpack
+from imu_calibration.references.gravity.hand_parameters import HandModel
 
 TREMBLING, CREEPING = 1.5e-3, 5e-4
 """m/s^2, rad/s (0.03 deg/s); expected sd of the means of a pose from noise, trembling and creeping hands, before it is estimated."""
@@ -56,7 +56,7 @@ class HandKnowledge:
 
     def after(self, ups: np.ndarray, turns: np.ndarray) -> np.ndarray:
         """Return the information after a turn to each of several directions, with these `turn_rows` (k, 2, 9), and a rest."""
-        bias, matrix, *_ = unpack(self.values)
+        bias, matrix, *_ = self.model.linear(self.values)
         forces = bias + self.model.gravity * ups @ matrix.T
         # temperature and time at the reference point: one more pose there has no information about thermal effects
         count = len(ups)
@@ -69,8 +69,8 @@ class HandKnowledge:
         """Return the design of poses in sd, shape (k, 6, n): from lengths of gravity (k, n), rates at rest, turns (k, 2, 9)."""
         rows = np.zeros((len(norms), 6, self.model.size))
         rows[:, 0] = norms / self.pose_sd
-        rows[:, 1:4, GYRO_BIAS] = np.eye(3) / self.drift_sd
-        rows[:, 4:6, GYRO_MATRIX] = turns / self.turn_sd
+        rows[:, 1:4, self.model.gyro_bias] = np.eye(3) / self.drift_sd
+        rows[:, 4:6, self.model.gyro_matrix] = turns / self.turn_sd
         return rows
 
     def sd(self, information: np.ndarray) -> np.ndarray:
@@ -137,7 +137,7 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     for name, status, sd, tolerance in zip(hand.param_names, hand.statuses, hand.own_sd, hand.tolerances, strict=True):
         if status in LACKING:
             lacking.setdefault(name.split('.')[0], {})[name] = float(sd / tolerance)
-    parts = {sensor: [hand.model.param_names.index(name) for name in lacking[sensor]] for sensor in SENSORS if sensor in lacking}
+    parts = {sensor: [hand.param_names.index(name) for name in lacking[sensor]] for sensor in SENSORS if sensor in lacking}
     plan = foretold(knowledge)[:1] if parts else []
 
     def gain(part, step):
@@ -183,14 +183,13 @@ def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHan
 def knowledge_after(hand: HandCalibration) -> HandKnowledge:
     """Return the HandKnowledge of a solution: its information, reduced by the growth of its standard deviations beyond noise."""
     model, statistics, poses = hand.model, hand.statistics, hand.poses
-    published = [hand.param_names.index(name) for name in model.param_names]
     expected = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
     known = expected < 0.5 * model.priors
-    wider = max(1.0, float(np.max(np.where(known, hand.own_sd[published] / expected, 0.0))))
+    wider = max(1.0, float(np.max(np.where(known, hand.own_sd / expected, 0.0))))
     pose_sd = np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd'])
     drift_sd = np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd'])
     turn_sd = max(statistics['turn_scatter_sd'], 1e-4)
-    return HandKnowledge(model, hand.state.values, hand.information / wider**2, MARGIN * hand.tolerances[published],
+    return HandKnowledge(model, hand.state.values, hand.information / wider**2, MARGIN * hand.tolerances,
                          float(wider * pose_sd), float(wider * drift_sd), float(wider * turn_sd), ups_of(poses)[-1])
 
 

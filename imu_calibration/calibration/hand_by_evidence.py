@@ -73,9 +73,9 @@ def _faint(hand, found, asked):
     """Return the effects that were added and are implausible or have no significant coefficient."""
     faint = []
     for question in found.adopted:
-        effect, part = question.effect, hand.model.parts[question.effect.key]
+        effect, part = question.effect, hand.model.model.slices[question.effect.key]
         at = np.arange(part.start, part.start + effect.n_amplitudes)
-        values, sd = hand.state.values[at], np.array([hand.sd_of(hand.model.param_names[k]) for k in at])
+        values, sd = hand.values[at], hand.sd[at]
         if question.name not in asked[question.sensor] and (effect.surpasses(values) or not one_significant(values, sd)):
             faint.append(question)
     return faint
@@ -87,7 +87,7 @@ def extended_by_hand(data: HandData, found: 'HandInvestigation', options: HandOp
     hand = solve_by_hand(data, replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS}), found.point())
     terms = hand.terms
     for question in (*found.denied, *found.implausible):
-        moved = found.search.moved_by(found.named, question, found.baseline.model.param_names)
+        moved = found.search.moved_by(found.named, question, found.baseline.param_names)
         shift = np.array([moved.get(name, 0.0) for name in hand.param_names])
         terms = with_term(terms, REJECTED, np.outer(shift, shift))
     return replace(hand, terms=terms)

@@ -16,7 +16,6 @@ from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.references.gravity.equations import COMPONENTS, Poses, TurnData, between_middles, build_system
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_options import ByHandSettings
-from imu_calibration.references.gravity.hand_parameters import GYRO_BIAS, GYRO_MATRIX
 from imu_calibration.references.gravity.poses import distinct_attitudes
 
 FOLDS = 8
@@ -53,7 +52,7 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
     judged = poses.time >= (LAST_SHARE * end_by_hand(poses) if uncorrected.sizes else 0.0)
     norms, angles = [], []
     for out, without in held_out_values(hand, turns, settings):
-        values, part = _applied(model, without, uncorrected.centre), _selected(poses, out & judged)
+        values, part = applied_values(model.model, without, uncorrected.centre), _selected(poses, out & judged)
         left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last]) and judged[turn.first]]
         norms.append([(np.linalg.norm(_corrected(model, each, part.force, np.zeros_like(part.force), part.temperature_c).force, axis=1)
                        - hand.gravity)**2 for each in (plain, values)])
@@ -90,15 +89,8 @@ def end_by_hand(poses: Poses) -> float:
 
 def uncorrected_by_hand(hand: HandCalibration) -> Uncorrected:
     """Return the effects in time that compensation replaces by their value at the end of the recording."""
-    values = hand.model.in_model_order(hand.state.values)
+    values = hand.state.values
     return uncorrected_in_time(hand.model.model.at(values), values, hand.poses.time, end=end_by_hand(hand.poses))
-
-
-def _applied(model, values, centre):
-    """Return the parameters that compensation applies, in the order of the HandModel."""
-    sensors = model.model
-    known = dict(zip(sensors.param_names, applied_values(sensors, model.in_model_order(values), centre), strict=True))
-    return np.array([known[name] for name in model.param_names])
 
 
 class _Rows:
@@ -109,8 +101,7 @@ class _Rows:
         system = build_system(model, hand.state, hand.used_poses, turns=turns)
         scatter = np.array([*(hand.statistics[f'{name}_scatter_sd']**2 for name in COMPONENTS), 0.0])
         weight = 1.0 / np.sqrt(system.noise + scatter[system.component])
-        held = np.array([dict(zip(hand.param_names, hand.statuses)).get(name) == HELD for name in model.param_names])
-        self.values, self.free = hand.state.values, ~held
+        self.values, self.free = hand.state.values, ~(np.array(hand.statuses) == HELD) & ~model.fixed
         self.rows = np.column_stack([system.nuisance, system.main[:, self.free], system.residual]) * weight[:, None]
         ends = [(turn.first, turn.last) if turn.rotation is None else (count, count) for turn in turns
                 for _ in range(2 if turn.rotation is None else 3)]
@@ -141,15 +132,14 @@ def _selected(poses, mask):
 
 def _corrected(model, values, force, rate, temperature_c):
     """Return readings corrected as by compensation with some parameters."""
-    own = model.in_model_order(values)
-    known = Calibration(model.model.at(own), own, np.zeros((len(own),) * 2), (HELD,) * len(own))
+    known = Calibration(model.model.at(values), values, np.zeros((model.size,) * 2), (HELD,) * model.size)
     return compensate(known, force, rate, alpha_s=np.zeros_like(force), temperature_c=temperature_c)
 
 
 def _missed(model, values, poses, turns, gyroscope):
     """Return the angle errors of turns, rad, with the accelerometer of `values` and the parameters `gyroscope` of the gyroscope."""
     mixed = values.copy()
-    for part in (GYRO_BIAS, GYRO_MATRIX, model.extra_index('gyroscope')):
+    for part in (model.gyro_bias, model.gyro_matrix, model.extra_index('gyroscope')):
         mixed[part] = gyroscope[part]
     true = _corrected(model, values, poses.force, np.zeros_like(poses.force), poses.temperature_c).force
     up = true / np.linalg.norm(true, axis=1, keepdims=True)

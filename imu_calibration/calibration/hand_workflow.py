@@ -18,7 +18,7 @@ from imu_calibration.document.verdict import judged
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.estimation.covariance_terms import GRAVITY
-from imu_calibration.estimation.status import HELD, reasons_held, statuses, tolerances_of
+from imu_calibration.estimation.status import HELD, reasons_held, statuses
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
@@ -140,12 +140,10 @@ def hand_result(evident: EvidentHand, recording: HandRecording, options: Calibra
     check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
     model, gathered = hand.model.model, recording.gathered
     gathered.findings = findings = (*findings, *notes(hand.statistics['bias_moved'], gathered.duration))
-    order = [hand.param_names.index(name) for name in model.param_names]
-    uncorrected, at = uncorrected_by_hand(hand), np.ix_(order, order)
-    values, slope = centred(final := model.at(hand.values[order]), hand.values[order], uncorrected.centre)
-    terms = {name: np.diag(slope @ term[at] @ slope.T) for name, term in hand.terms.items()}
-    covariance = slope @ hand.covariance[at] @ slope.T
-    held, tolerances = np.array([hand.statuses[k] == HELD for k in order]), tolerances_of(model, options.tolerances)
+    uncorrected = uncorrected_by_hand(hand)
+    values, slope = centred(final := model.at(hand.values), hand.values, uncorrected.centre)
+    terms = {name: np.diag(slope @ term @ slope.T) for name, term in hand.terms.items()}
+    covariance, held, tolerances = slope @ hand.covariance @ slope.T, np.array(hand.statuses) == HELD, hand.tolerances
     statistics = _statistics(hand, gathered.counts, len(recording.imu)) | preflight_statistics(findings) | evident.changes.to_mapping()
     statistics |= uncorrected.to_mapping()
     status = statuses(np.sqrt(sum(term for name, term in terms.items() if name != GRAVITY)), held, tolerances)

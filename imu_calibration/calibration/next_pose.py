@@ -9,7 +9,7 @@ from imu_calibration.calibration.coverage import DIRECTIONS, Coverage, Step
 from imu_calibration.calibration.hand_result import HandResult
 from imu_calibration.calibration.pose_scan import Findings
 from imu_calibration.effects.sensor_model import BASE, SensorModel
-from imu_calibration.estimation.status import LACKING
+from imu_calibration.estimation.status import LACKING, tolerances_of
 from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.hand_parameters import HandModel
 
@@ -19,7 +19,7 @@ def knowledge_of(found: Findings, result: HandResult | None, options: HandOption
     if result is not None:
         return knowledge_after(result.hand)
     model = HandModel(SensorModel(options.accelerometer or BASE, options.gyroscope or BASE, catalogue=options.catalogue), options.gravity)
-    return knowledge_at_first(model, model.tolerances(options.tolerances), options.settings, poses=found.poses)
+    return knowledge_at_first(model, tolerances_of(model.model, options.tolerances), options.settings, poses=found.poses)
 
 
 def hand_coverage(found: Findings, result: HandResult | None, options: HandOptions, *, frame_id: str = '') -> Coverage:

@@ -6,7 +6,6 @@ block number, times the covariance, are shifts of the estimate between parts of 
 where the shifts exceed it significantly, the covariance grows.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy as np
 from imu_calibration.core.distributions import chi2_sf, f_sf
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.covariance_terms import DRIFT, MODEL_ERROR
 from imu_calibration.estimation.noise_model import NoiseModel, dof_factor
 from imu_calibration.estimation.scaled_solve import inverse_normal
@@ -70,9 +70,7 @@ def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, No
     if len(system.accumulator.blocks) < LEAST_BLOCKS or not free.any():
         return ModelError(np.ones(len(values)), *np.zeros((2, len(values))))
     waves = _waves_of_blocks(*block_scores(system, values, noises), system.prior.root, free)
-    model = system.model
-    groups = {sensor: [model.slices[e.key] for e in model.effects if e.sensor == sensor] for sensor in {e.sensor for e in model.effects}}
-    found, misfits = errors_of_waves(waves, len(values), groups=groups)
+    found, misfits = errors_of_waves(waves, system.model)
     if 'accelerometer' in misfits:   # an error that depends on the attitude has a mean as large as its scatter, absorbed by the bias
         found.scatter_variance[system.model.part('accelerometer', Role.OFFSET)] += UNSEEN * _scatter_of_means(noises['accelerometer'])
     return found
@@ -83,22 +81,21 @@ def _scatter_of_means(noise):
     return noise.offset_sd**2 + sum(process.sd**2 for process in noise.bias_processes if process.time < NO_BIAS)
 
 
-def errors_of_waves(waves: 'Waves', size: int, *, groups: Mapping[str, Sequence[slice]]) -> tuple[ModelError, set[str]]:
+def errors_of_waves(waves: 'Waves', model: SensorModel) -> tuple[ModelError, set[str]]:
     """
     Return (ModelError, sensors with significant scatter) from the shifts between parts of a recording.
 
     Parameters
     ----------
     waves : Waves
-    size : int
-        Number of parameters.
-    groups : mapping
-        Sensor -> the parameters of each of its effects.
+    model : SensorModel
+        Its parameters; a group are those of one effect.
 
     """
-    factor, more, misfits = np.ones(size), np.zeros(size), set()
-    for sensor, parts in groups.items():
-        shown = [group for group in map(waves.group, parts) if len(group)]
+    size, misfits = len(model.param_names), set()
+    factor, more = np.ones(size), np.zeros(size)
+    for sensor in {effect.sensor for effect in model.effects}:
+        shown = [group for effect in model.effects if effect.sensor == sensor and len(group := waves.group(model.slices[effect.key]))]
         if shown and fisher([waves.drift(group)[0] for group in shown]) < CHANCE:
             for group in shown:
                 more[waves.places[group]] = waves.drift(group)[1]

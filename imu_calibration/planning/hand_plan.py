@@ -61,8 +61,9 @@ def plan_by_hand(model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str
     for step in steps:
         knowledge = knowledge.then(step)
         history.append(knowledge.sd(knowledge.information))
-    return HandPlan(tuple(steps), sum(step.seconds for step in steps), model.param_names, history[-1], tolerances,
-                    np.array(history) / tolerances)
+    names, free = np.array(model.model.param_names)[~model.fixed].tolist(), np.array(history)[:, ~model.fixed]
+    return HandPlan(tuple(steps), sum(step.seconds for step in steps), tuple(names), free[-1], tolerances[~model.fixed],
+                    free / tolerances[~model.fixed])
 
 
 def hand_plan_to_mapping(plan: HandPlan, provenance: dict[str, Any]) -> dict[str, Any]:

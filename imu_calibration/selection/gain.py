@@ -91,7 +91,8 @@ def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
 
 def gain_of(sensor: str, measure: str, pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> Gain:
     """Return the Gain from (sums of squares, numbers) of each group of rows, before and after."""
-    return Gain(sensor, measure, *(_rms(*entry) for entry in pair), reduction_interval(pair), len(pair[0][0]))
+    before, after = (_rms(*entry) for entry in pair)
+    return Gain(sensor, measure, before, after, reduction_interval(pair), len(pair[0][0]))
 
 
 def _squares(space, values, sensor):

@@ -19,6 +19,7 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE, SensorModel, parse_effects
+from imu_calibration.estimation.status import tolerances_of
 from imu_calibration.kinematics.motion_limits import NOT_CHECKED, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.campaign import make_separator
@@ -243,7 +244,7 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
     accelerometer, gyroscope = (parse_effects(sensor, asked[sensor] or '+'.join(BASE), catalogue=options.catalogue) for sensor in SENSORS)
     model = HandModel(SensorModel(accelerometer, gyroscope, catalogue=options.catalogue), options.gravity or STANDARD_GRAVITY)
     noise = expected_noise(options.noise, grade, imu_rate)
-    found = plan_by_hand(model, tolerances=model.tolerances(options.tolerances), noise=noise, rate=imu_rate)
+    found = plan_by_hand(model, tolerances=tolerances_of(model.model, options.tolerances), noise=noise, rate=imu_rate)
     return PlannedByHand(found, model, {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
                                          'reference': 'gravity, by hand'})
 

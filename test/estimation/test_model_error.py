@@ -165,17 +165,18 @@ def test_a_drift_shows_beside_noise_that_was_taken_too_large():
         rng = np.random.default_rng(5)
         moved = fast * rng.choice([-1.0, 1.0], (12, 3))
         moved[0] = 1.7
-        return Waves(np.arange(3), moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3))
+        return Waves(own, moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3))
 
-    every = {'gyroscope': [slice(0, 3)]}
-    assert np.all(errors_of_waves(waves(0.33), 3, groups=every)[0].drift_variance > 1.0)
-    assert not errors_of_waves(waves(1.0), 3, groups=every)[0].drift_variance.any()
+    own = np.arange(len(SensorModel().param_names))[SensorModel().slices['gyroscope', 'bias']]
+    assert np.all(errors_of_waves(waves(0.33), SensorModel())[0].drift_variance[own] > 1.0)
+    assert not errors_of_waves(waves(1.0), SensorModel())[0].drift_variance.any()
 
 
 def test_parts_that_ask_for_more_than_noise_explains_widen_by_half_more_than_they_show():
     """Twelve cosines, each of two sds: the excess of three variances counts 1.5 times."""
     moved = 2.0 * np.random.default_rng(6).choice([-1.0, 1.0], (12, 3))
-    waves = Waves(np.arange(3), moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3))
-    found, misfits = errors_of_waves(waves, 3, groups={'gyroscope': [slice(0, 3)]})
+    own = SensorModel().slices['gyroscope', 'bias']
+    waves = Waves(np.arange(own.start, own.stop), moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3))
+    found, misfits = errors_of_waves(waves, SensorModel())
     assert misfits == {'gyroscope'}
-    np.testing.assert_allclose(found.factor, np.sqrt(1 + 1.5 * 3))
+    np.testing.assert_allclose(found.factor[own], np.sqrt(1 + 1.5 * 3))

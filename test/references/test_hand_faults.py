@@ -21,12 +21,12 @@ from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand, with_weak_replaced
 from imu_calibration.references.gravity.hand_options import HandOptions, hand_options
-from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, UPPER, unpack
+from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, UPPER
 from imu_calibration.references.gravity.poses import average_poses
 from imu_calibration.references.gravity.turns import at_range_end, rising, sample_times
 from imu_calibration.references.options import CalibrationOptions
 
-from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth
+from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth, unpack
 from worlds.hand_trials import clean, jitter
 from worlds.physics_hand import clipped, drifting, hold_and_turn, warmed_up, with_slow_turn, with_stamp_jitter, with_wrong_full_scale
 from worlds.physics_table import stand_up

@@ -4,14 +4,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.references.gravity.hand_parameters import HandModel, unpack
 
 GRAVITY = 9.81
-FULL = HandModel(SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity')), GRAVITY)
-"""Truths are laid out as the parameters of this model."""
-NOMINAL, PARAM_NAMES, SENSITIVITY = FULL.nominal, FULL.param_names, slice(21, 30)
+LOWER, SQUARE = ('xx', 'yx', 'yy', 'zx', 'zy', 'zz'), tuple(a + b for a in 'xyz' for b in 'xyz')
+PARAM_NAMES = (*(f'accelerometer.bias.{k}' for k in 'xyz'), *(f'accelerometer.matrix.{k}' for k in LOWER),
+               *(f'gyroscope.bias.{k}' for k in 'xyz'), *(f'gyroscope.matrix.{k}' for k in SQUARE), *(f'gyroscope.gyro_g_sensitivity.{k}' for k in SQUARE))
+"""Truths are laid out like this: the accelerometer's matrix without the elements above its diagonal, which are zero."""
+NOMINAL, SENSITIVITY = np.array([float(name.endswith(('matrix.xx', 'matrix.yy', 'matrix.zz'))) for name in PARAM_NAMES]), slice(21, 30)
 FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+
+
+def unpack(truth):
+    """Return bias and matrix of the accelerometer and of the gyroscope."""
+    lower = np.zeros((3, 3))
+    lower[np.tril_indices(3)] = truth[3:9]
+    return truth[0:3], lower, truth[9:12], truth[12:21].reshape(3, 3)
 
 
 def random_truth(rng, sensitivity=0.0):

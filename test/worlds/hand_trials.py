@@ -6,9 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.references.gravity.hand_parameters import unpack
 
-from worlds.hand_sessions import FACES, GRAVITY, random_truth, turn_samples
+from worlds.hand_sessions import FACES, GRAVITY, random_truth, turn_samples, unpack
 
 RATE_HZ, RESTS, FIRST, STILL = 100.0, 43, 10.0, (2.5, 4.0)
 """The first rest, from which peers take noise and bias, and the shortest and longest of the others, s."""

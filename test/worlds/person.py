@@ -4,9 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.references.gravity.hand_parameters import unpack
 
-from worlds.hand_sessions import GRAVITY, random_truth, turn_samples
+from worlds.hand_sessions import GRAVITY, random_truth, turn_samples, unpack
 
 PERIOD = 0.01
 OFF = np.deg2rad(10.0)

@@ -6,9 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.references.gravity.hand_parameters import unpack
 
-from worlds.hand_sessions import GRAVITY, SENSITIVITY, random_truth, turn_samples
+from worlds.hand_sessions import GRAVITY, SENSITIVITY, random_truth, turn_samples, unpack
 
 SETTLES = 0.5
 """Time constant of a grip that gives way, s."""

@@ -14,6 +14,7 @@ from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.calibration.hand_by_evidence import extended_by_hand
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.status import HELD
 from imu_calibration.references.gravity.effect_rows import Block
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, HandData
 from imu_calibration.references.gravity.hand_options import HandOptions
@@ -75,19 +76,13 @@ PER_TURN = 'rad/turn'
 def as_solution(hand: HandCalibration) -> Solution:
     """Return a HandCalibration as the `Solution` of documents and reports."""
     model = hand.model.model
-    order = [hand.param_names.index(name) for name in model.param_names]
-    held = np.array([hand.statuses[k] == 'held' for k in order])
-    information = np.zeros((len(order), len(order)))
-    own = [model.param_names.index(name) for name in hand.model.param_names]
-    information[np.ix_(own, own)] = hand.information
     noise, rms, chi2 = {}, {}, {}
     residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': _rates_left(hand)}
     for sensor, scatter in (('accelerometer', 'pose'), ('gyroscope', 'drift')):
         noise[sensor] = replace(hand.poses.noise[sensor], offset_sd=hand.statistics[f'{scatter}_scatter_sd'])
         rms[sensor] = np.full(2, np.sqrt(np.mean(residuals[sensor]**2)))
         chi2[sensor] = {'mean': None}
-    terms = {name: term[np.ix_(order, order)] for name, term in hand.terms.items()}
-    return Solution(model, hand.values[order], terms, held, noise, chi2, information, rms)
+    return Solution(model, hand.values, hand.terms, np.array(hand.statuses) == HELD, noise, chi2, hand.information, rms)
 
 
 def _rates_left(hand):

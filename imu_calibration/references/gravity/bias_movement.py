@@ -9,7 +9,7 @@ from scipy.special import fdtrc
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
 from imu_calibration.references.gravity.equations import Poses
-from imu_calibration.references.gravity.hand_parameters import ACCELEROMETER, GYRO_BIAS, HandModel
+from imu_calibration.references.gravity.hand_parameters import HandModel
 
 P_VALUE = 1e-3
 """A drift is significant below this p-value."""
@@ -40,8 +40,9 @@ def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[s
     residual, columns = model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
     true = model.compensate(values, poses.force, np.zeros_like(poses.force), time=poses.time, temperature_c=poses.temperature_c)[0]
     more = model.further('gyroscope', values, true, rate=np.zeros_like(true), time=poses.time, temperature_c=poses.temperature_c)[0]
-    turning = (poses.rate - values[GYRO_BIAS] - more)
-    found = {'accelerometer': _of_norms(time, residual, columns[:, ACCELEROMETER]), 'gyroscope': _of_rates(time, turning)}
+    turning = (poses.rate - values[model.gyro_bias] - more)
+    base = columns[:, model.base_index('accelerometer')]
+    found = {'accelerometer': _of_norms(time, residual, base), 'gyroscope': _of_rates(time, turning)}
     return {sensor: movement for sensor, movement in found.items() if movement is not None}
 
 
@@ -100,7 +101,7 @@ def with_movement(covariance: np.ndarray, model: HandModel, movements: Mapping[s
     """Return the covariance with the drift: the bias at any time of the recording is within one sd of the reported mean."""
     grown = covariance.copy()
     for sensor, movement in movements.items():
-        index = model.index_of(sensor)[:len(movement.growth)]
+        index = model.base_index(sensor)
         factor = np.ones(model.size)
         factor[index] = movement.growth
         grown *= np.outer(factor, factor)

@@ -99,8 +99,7 @@ def _columns(hand, effect, tau, force, rate, time, temperature_c):
     point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
     names = {sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS}
     model = HandModel(replace(hand.model.model, **names, point=point), hand.gravity)
-    known = dict(zip(hand.model.param_names, hand.state.values))
-    values = np.array([known.get(name, value) for name, value in zip(model.param_names, model.nominal)])
+    values = model.model.start_from(hand.model.model, hand.state.values)
     return model.further(effect.sensor, values, force, rate=rate, time=time, temperature_c=temperature_c)[1]
 
 
@@ -131,7 +130,7 @@ def _rest_block(hand, space, at_rest, sensor_of):
     more, slopes = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time,
                                       temperature_c=poses.temperature_c)
     rows = np.zeros((count, 3, space.size + 1))
-    rows[:, :, 9:12] = np.eye(3)
+    rows[:, :, hand.model.gyro_bias] = np.eye(3)
     rows[:, :, hand.model.size] = hand.state.up
     rows[:, :, hand.model.extra_index('gyroscope')] = slopes
     rows[:, :, -1] = poses.rate - hand.gyroscope[0] - more
@@ -164,7 +163,7 @@ def _turn_block(hand, turns, space, at_rest, moving):
         carried = between_middles(hand.poses, turn, found.mat_ji) @ hand.state.up[i]
         by_psi = across[j].T @ skew(carried) / found.duration
         row = np.zeros((2, space.size + 1))
-        row[:, 12:21] = by_psi @ found.by_matrix.reshape(3, 9)
+        row[:, hand.model.gyro_matrix] = by_psi @ found.by_matrix.reshape(3, 9)
         place = 0
         for effect in moving:
             row[:, space.parts[effect.name]] = by_psi @ found.by_further[:, place:place + effect.size]

@@ -8,7 +8,7 @@ import numpy as np
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
-from imu_calibration.references.gravity.hand_parameters import GYRO_BIAS, GYRO_MATRIX, LOWER, HandModel, unpack
+from imu_calibration.references.gravity.hand_parameters import HandModel
 
 COMPONENTS = ('pose', 'drift', 'turn')
 """Scatter beyond the noise: of the accelerometer between poses, of the gyroscope's bias, of the turns."""
@@ -77,7 +77,7 @@ class State:
     """Estimated quantities."""
 
     values: np.ndarray
-    """Parameters in the order of the `HandModel`, shape (n,)."""
+    """Parameters in the order of the model, shape (n,)."""
     up: np.ndarray
     """True direction of the specific force in each pose, unit vectors, shape (k, 3)."""
     drift: np.ndarray
@@ -141,15 +141,15 @@ def build_system(model: HandModel, state: State, poses: Poses, *, turns: Sequenc
 
 def _pose_rows(model, state, poses, across):
     """``force = bias + matrix @ (gravity * up) + further effects``: three rows per pose, two of them used for its direction."""
-    bias, matrix, *_ = unpack(state.values)
+    bias, matrix, *_ = model.linear(state.values)
     count = len(state.up)
     true = model.gravity * state.up
     more, slopes = model.further('accelerometer', state.values, true, rate=np.zeros_like(true), time=poses.time,
                                  temperature_c=poses.temperature_c)
     main = np.zeros((count, 3, model.size))
     main[:, :, 0:3] = np.eye(3)
-    for column, (i, j) in enumerate(LOWER):
-        main[:, i, 3 + column] = true[:, j]
+    for i in range(3):
+        main[:, i, 3 + 3 * i:4 + 4 * i] = true[:, :i + 1]
     main[:, :, model.extra_index('accelerometer')] = slopes
     nuisance = np.zeros((count, 3, 5 * count))
     blocks = model.gravity * matrix @ across
@@ -165,9 +165,9 @@ def _drift_rows(model, state, poses):
     more, slopes = model.further('gyroscope', state.values, true, rate=np.zeros_like(true), time=poses.time,
                                  temperature_c=poses.temperature_c)
     main = np.zeros((count, 3, model.size))
-    main[:, :, GYRO_BIAS] = np.eye(3)
+    main[:, :, model.gyro_bias] = np.eye(3)
     main[:, :, model.extra_index('gyroscope')] = slopes
-    return _flat(poses.rate - state.values[GYRO_BIAS] - more - state.drift, _drift_columns(count), main, poses.rate_sem**2, -1)
+    return _flat(poses.rate - state.values[model.gyro_bias] - more - state.drift, _drift_columns(count), main, poses.rate_sem**2, -1)
 
 
 def _calm_rows(model, state, poses):
@@ -185,7 +185,7 @@ def _drift_columns(count):
 
 def _integrated(model, state, data, bias, key, memory):
     """Return (mat_ji, Turn), from memory when the gyroscope's parameters have hardly changed since."""
-    matrix, further = unpack(state.values)[3], state.values[model.extra_index('gyroscope')]
+    matrix, further = model.linear(state.values)[3], state.values[model.extra_index('gyroscope')]
     if key in memory:
         (old_bias, old_matrix, old_further), turn = memory[key]
         psi = (turn.by_bias @ (bias - old_bias) + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel()
@@ -207,32 +207,32 @@ def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndar
 def _gravity_turn_rows(model, state, data, key, memory, across, poses):
     """The direction before the turn, rotated by the gyroscope, against the direction after it: two rows, from middle to middle."""
     count, i, j = len(state.up), data.first, data.last
-    mat_ji, turn = _integrated(model, state, data, state.values[GYRO_BIAS] + 0.5 * (state.drift[i] + state.drift[j]), key, memory)
+    mat_ji, turn = _integrated(model, state, data, state.values[model.gyro_bias] + 0.5 * (state.drift[i] + state.drift[j]), key, memory)
     mat_ji = between_middles(poses, data, mat_ji)
     carried = mat_ji @ state.up[i]
     across_i, across_j = across[i], across[j]
     by_psi = across_j.T @ skew(carried)
     main, nuisance = np.zeros((2, model.size)), np.zeros((2, 5 * count))
-    main[:, GYRO_BIAS] = by_psi @ turn.by_bias
-    main[:, GYRO_MATRIX] = by_psi @ turn.by_matrix.reshape(3, 9)
+    main[:, model.gyro_bias] = by_psi @ turn.by_bias
+    main[:, model.gyro_matrix] = by_psi @ turn.by_matrix.reshape(3, 9)
     main[:, model.extra_index('gyroscope')] = by_psi @ turn.by_further
     nuisance[:, 2 * i:2 * i + 2] += across_j.T @ mat_ji @ across_i
     nuisance[:, 2 * j:2 * j + 2] -= (carried @ state.up[j]) * np.eye(2)
     for pose in (i, j):
-        nuisance[:, 2 * count + 3 * pose:2 * count + 3 * pose + 3] += 0.5 * main[:, GYRO_BIAS]
+        nuisance[:, 2 * count + 3 * pose:2 * count + 3 * pose + 3] += 0.5 * main[:, model.gyro_bias]
     return -across_j.T @ carried, nuisance, main, np.full(2, data.noise_variance), np.full(2, 2)
 
 
 def _known_turn_rows(model, state, data):
     """``matrix^-1 integral(measured - bias - further effects) = rotation`` for a turn about a fixed body axis, whitened: three rows."""
-    _, _, bias, matrix = unpack(state.values)
+    _, _, bias, matrix = model.linear(state.values)
     further = _further_of_turn(model, state, data, bias)
     turn = integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=further)
     inverse = np.linalg.inv(matrix)
     rotation = inverse @ turn.integral
     main = np.zeros((3, model.size))
-    main[:, GYRO_BIAS] = -turn.duration * inverse
-    main[:, GYRO_MATRIX] = -np.einsum('rp,q->rpq', inverse, rotation).reshape(3, 9)
+    main[:, model.gyro_bias] = -turn.duration * inverse
+    main[:, model.gyro_matrix] = -np.einsum('rp,q->rpq', inverse, rotation).reshape(3, 9)
     impulse = np.einsum('m,mip->ip', np.diff(data.time), 0.5 * (further[1][:-1] + further[1][1:]))
     main[:, model.extra_index('gyroscope')] = -inverse @ impulse
     white = np.linalg.inv(np.linalg.cholesky(data.rotation_cov + data.noise_variance * np.eye(3)))
@@ -241,7 +241,7 @@ def _known_turn_rows(model, state, data):
 
 def _further_of_turn(model, state, data, bias):
     """Return output and columns of the gyroscope's further effects along a turn, at the forces and rates without them."""
-    bias_f, matrix_f, _, matrix = unpack(state.values)
+    bias_f, matrix_f, _, matrix = model.linear(state.values)
     force, rate = np.linalg.solve(matrix_f, (data.force - bias_f).T).T, np.linalg.solve(matrix, (data.rate - bias).T).T
     return model.further('gyroscope', state.values, force, rate=rate, time=data.time, temperature_c=data.temperature_c)
 

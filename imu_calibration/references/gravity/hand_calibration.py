@@ -13,13 +13,13 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
 from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, Terms, replace_weak, sd_without, total, with_term
 from imu_calibration.estimation.model_error import ModelError
-from imu_calibration.estimation.status import FIXED, HELD, statuses
+from imu_calibration.estimation.status import HELD, statuses, tolerances_of
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import bias_movements, with_movement, without_movement
 from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_options import ByHandSettings, HandOptions, KnownTurn
-from imu_calibration.references.gravity.hand_parameters import BASE_NAMES, CROSS_TERMS, UPPER, HandModel, unpack
+from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandModel
 from imu_calibration.references.gravity.pose_outliers import possible_turns, without_outliers
 from imu_calibration.references.gravity.pose_solver import first_state, solve_joint
 from imu_calibration.references.gravity.poses import average_poses, distinct_attitudes, noise_statistics
@@ -29,8 +29,6 @@ from imu_calibration.selection.linearisation import at_time_constants
 
 GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
 """x along the accelerometer's x input axis, y in the plane of its x and y input axes."""
-PUBLISHED = tuple(SensorModel().param_names)
-"""Order of the parameters in the result; further effects follow."""
 POSES_LEAST = 4
 """With fewer attitudes even the accelerometer's biases are determined by the prior."""
 SIGNIFICANT = 1.96**2
@@ -108,14 +106,14 @@ class HandCalibration:
     @property
     def accelerometer(self) -> tuple[np.ndarray, np.ndarray]:
         """(bias, matrix) of the accelerometer."""
-        return unpack(self.state.values)[:2]
+        return self.model.linear(self.state.values)[:2]
 
     @property
     def gyroscope(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity."""
         effect = self.model.model.find('gyroscope', Role.CROSS)
-        response = np.zeros((3, 3)) if effect is None else self.state.values[self.model.parts[effect.key]].reshape(3, 3)
-        return *unpack(self.state.values)[2:], response
+        response = np.zeros((3, 3)) if effect is None else self.state.values[self.model.model.slices[effect.key]].reshape(3, 3)
+        return *self.model.linear(self.state.values)[2:], response
 
     def compensate(self, force: np.ndarray, rate: np.ndarray, time: np.ndarray | None = None, *,
                    temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -232,7 +230,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
         found = solved(model, poses, turns)
     terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
     used, poses = poses, data.poses   # the result has all poses unchanged, also excluded and drifting ones
-    goals = model.tolerances(options.tolerances)
+    goals = tolerances_of(model.model, options.tolerances)
     status = statuses(sd_without(terms, GRAVITY), found.held, goals)
     statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
                   'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()},
@@ -240,13 +238,9 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     if options.gravity_sd:
         sd, goal = options.gravity_sd / options.gravity, float(goals[3])
         statistics['common_scale'] = {'sd': sd, 'tolerance': goal, 'status': str(statuses([sd], [False], [goal])[0])}
-    names = (*PUBLISHED, *model.param_names[len(BASE_NAMES):])
-    index = np.array([model.param_names.index(name) if name not in UPPER else -1 for name in names])
-    padded = {name: np.pad(term, (0, 1))[np.ix_(index, index)] for name, term in terms.items()}  # index -1: zero by convention, certain
-    return HandCalibration(names, np.append(found.state.values, 0.0)[index], padded,
-                           tuple((*status, FIXED)[k] for k in index), np.append(goals, goals[3])[index],
-                           np.append(model.priors, 0.0)[index], options.gravity, dict(GAUGE), statistics, poses, found.state, model,
-                           found.factor.T @ found.factor, used, turns, found.model_error)
+    return HandCalibration(tuple(model.model.param_names), found.state.values, terms, status, goals, model.priors, options.gravity,
+                           dict(GAUGE), statistics, poses, found.state, model, found.factor.T @ found.factor, used, turns,
+                           found.model_error)
 
 
 def with_weak_replaced(hand: HandCalibration) -> HandCalibration:
@@ -257,21 +251,19 @@ def with_weak_replaced(hand: HandCalibration) -> HandCalibration:
     the poses determine them only through small tilts; other parameters where that lowers the expected error.
     """
     held = np.array([status == HELD for status in hand.statuses])
-    nominal = dict.fromkeys(UPPER, 0.0) | dict(zip(hand.model.param_names, hand.model.nominal))
     applied = {name for effect in hand.model.model.effects if effect.compensation == 'exact' for name in effect.param_names()}
     weak = np.flatnonzero(~held & (hand.own_sd > hand.tolerances) & np.isin(hand.param_names, list(applied)))
-    values, terms, replaced = replace_weak(hand.values, hand.terms, np.array([nominal[name] for name in hand.param_names]),
-                                           weak=weak.tolist(), limit=np.where(np.isin(hand.param_names, CROSS_TERMS), SIGNIFICANT, 1.0))
-    known = dict(zip(hand.param_names, values))
-    state = replace(hand.state, values=np.array([known[name] for name in hand.model.param_names]))
-    return replace(hand, values=values, terms=terms, state=state, replaced=tuple(np.array(hand.param_names)[replaced].tolist()),
+    values, terms, replaced = replace_weak(hand.values, hand.terms, hand.model.nominal, weak=weak.tolist(),
+                                           limit=np.where(np.isin(hand.param_names, CROSS_TERMS), SIGNIFICANT, 1.0))
+    return replace(hand, values=values, terms=terms, state=replace(hand.state, values=values),
+                   replaced=tuple(np.array(hand.param_names)[replaced].tolist()),
                    statuses=statuses(sd_without(terms, GRAVITY), held | replaced, hand.tolerances))
 
 
 def _settled(model, found):
     """Return whether the columns of warm-ups were computed close enough to the solution."""
     for effect in model.extras:
-        part = model.parts[effect.key]
+        part = model.model.slices[effect.key]
         if effect.time_constant and not found.held[part][-1]:
             known = model.model.point_of(effect)[-1]
             if abs(found.state.values[part][-1] / known - 1) > SETTLED:
@@ -299,7 +291,8 @@ def _statistics(model, found, poses, turns):
     before, after = (model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0]
                      for values in (model.nominal, found.state.values))
     sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
-    spare = len(after) - int(np.sum(~found.held[model.index_of('accelerometer')]))
+    of_accelerometer = np.char.startswith(model.model.param_names, 'accelerometer')
+    spare = len(after) - int(np.sum(of_accelerometer & ~found.held & ~model.fixed))
     result = {'poses': len(poses.start), 'turns': len(turns), 'steps': found.steps,
               'norm_residual_rms_before': float(np.sqrt(np.mean(before**2))), 'norm_residual_rms': float(np.sqrt(np.mean(after**2))),
               'norm_chi2_per_dof': float(np.sum((after / sem)**2) / spare) if spare > 0 else None}

@@ -6,24 +6,17 @@ from functools import cached_property
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.effects.base import SENSORS, Effect
+from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.forward_equations import effect_slopes
 from imu_calibration.effects.sensor_model import SensorModel, linear_names
-from imu_calibration.estimation.status import tolerances_of
 from imu_calibration.kinematics.rotations import Reference
 
-LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
-"""Free entries of the accelerometer matrix under the gauge."""
 UPPER = tuple(linear_names('accelerometer')[np.triu_indices(3, 1)].tolist())
 """Zero by the choice of axes."""
-BASE_NAMES = tuple(name for name in SensorModel().param_names if name not in UPPER)
-"""Parameters of every calibration by hand, in their order."""
 CROSS_TERMS = tuple(linear_names('accelerometer')[np.tril_indices(3, -1)].tolist())
 """Estimated off-diagonal entries of the accelerometer matrix."""
-N_BASE = len(BASE_NAMES)
-ACCELEROMETER, GYRO_BIAS, GYRO_MATRIX = slice(0, 9), slice(9, 12), slice(12, 21)
-BASE_NOMINAL = np.array([0, 0, 0, 1, 0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1], float)
-"""Zero bias, identity matrices."""
+EXACT = 1e-12
+"""Sd of a parameter that a convention fixes."""
 UNKNOWN_BY_HAND = {'angular acceleration', 'attitude', 'joint angle', 'joint rate'}
 """Quantities that cannot be determined from gravity in poses and the rates between them."""
 REPEATS = 4
@@ -35,18 +28,10 @@ def possible_by_hand(effect: Effect) -> bool:
     return bool(effect.groups) and effect.warp is None and not any(group.uses & UNKNOWN_BY_HAND for group in effect.groups)
 
 
-def unpack(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix) of a parameter vector."""
-    matrix = np.zeros((3, 3))
-    for value, (i, j) in zip(values[3:9], LOWER):
-        matrix[i, j] = value
-    return values[0:3], matrix, values[GYRO_BIAS], values[GYRO_MATRIX].reshape(3, 3)
-
-
 @dataclass(frozen=True, eq=False)
 class HandModel:
     """
-    A SensorModel without table: `BASE_NAMES`, then the further effects of the accelerometer, then the gyroscope's.
+    A SensorModel without table, in its order of parameters; `UPPER` is fixed.
 
     Raises
     ------
@@ -75,59 +60,59 @@ class HandModel:
         """Effects beyond bias and matrix, in parameter order."""
         return self.model.further
 
-    @cached_property
-    def parts(self) -> dict[tuple[str, str], slice]:
-        """(sensor, effect name) -> slice of the parameter vector, for the further effects."""
-        ends = np.cumsum([N_BASE] + [e.size for e in self.extras])
-        return {e.key: slice(a, b) for e, a, b in zip(self.extras, ends, ends[1:])}
-
-    @cached_property
-    def param_names(self) -> tuple[str, ...]:
-        """SENSOR.EFFECT.COMPONENT of each parameter."""
-        return (*BASE_NAMES, *(name for e in self.extras for name in e.param_names()))
-
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return len(self.param_names)
+        return len(self.fixed)
+
+    @cached_property
+    def fixed(self) -> np.ndarray:
+        """Mask of the parameters that the choice of axes fixes, shape (n,)."""
+        return np.isin(self.model.param_names, UPPER)
 
     @cached_property
     def nominal(self) -> np.ndarray:
         """Values before any data, shape (n,)."""
-        start, base = self.model.start(), BASE_NOMINAL.copy()
-        base[GYRO_MATRIX] *= self.gyro_factor
-        return np.concatenate([base, *(start[self.model.slices[e.key]] for e in self.extras)])
+        start = self.model.start()
+        start[self.gyro_matrix] *= self.gyro_factor
+        return start
 
     @cached_property
     def priors(self) -> np.ndarray:
         """Standard deviations about `nominal` before any data, shape (n,)."""
-        known = dict(zip(self.model.param_names, self.model.prior()[1]))
-        sd = np.array([known[name] for name in self.param_names])
-        sd[GYRO_MATRIX] *= self.gyro_factor
+        sd = np.where(self.fixed, EXACT, self.model.prior()[1])
+        sd[self.gyro_matrix] *= self.gyro_factor
         return sd
 
-    def tolerances(self, given: dict) -> np.ndarray:
-        """Return the sufficient standard deviations, shape (n,); the catalogue's where `given` has none."""
-        known = dict(zip(self.model.param_names, tolerances_of(self.model, given)))
-        return np.array([known[name] for name in self.param_names])
+    @property
+    def gyro_bias(self) -> slice:
+        """Parameters of the bias of the gyroscope."""
+        return self.model.part('gyroscope', Role.OFFSET)
 
-    def index_of(self, sensor: str) -> np.ndarray:
-        """Return the parameters of one sensor, bias and matrix first."""
-        base = range(9) if sensor == 'accelerometer' else range(9, N_BASE)
-        return np.array([*base, *(k for (s, _), part in self.parts.items() if s == sensor for k in range(part.start, part.stop))])
+    @property
+    def gyro_matrix(self) -> slice:
+        """Parameters of the matrix of the gyroscope."""
+        return self.model.part('gyroscope', Role.LINEAR)
+
+    def base_index(self, sensor: str) -> np.ndarray:
+        """Return the estimated parameters of bias and matrix of one sensor."""
+        parts = [self.model.part(sensor, role) for role in (Role.OFFSET, Role.LINEAR)]
+        return np.array([k for part in parts for k in range(part.start, part.stop) if not self.fixed[k]])
 
     def extra_index(self, sensor: str) -> np.ndarray:
         """Return the parameters of the further effects of one sensor."""
-        return self.index_of(sensor)[9 if sensor == 'accelerometer' else 12:]
+        parts = [self.model.slices[e.key] for e in self.extras if e.sensor == sensor]
+        return np.array([k for part in parts for k in range(part.start, part.stop)], int)
+
+    def linear(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix) of a parameter vector."""
+        found = (values[self.model.part(sensor, role)] for sensor in SENSORS for role in (Role.OFFSET, Role.LINEAR))
+        bias_f, matrix_f, bias_w, matrix_w = found
+        return bias_f, matrix_f.reshape(3, 3), bias_w, matrix_w.reshape(3, 3)
 
     def at(self, values: np.ndarray) -> 'HandModel':
         """Return the same model with the columns of warm-ups computed at `values`."""
-        return replace(self, model=self.model.at(self.in_model_order(values)))
-
-    def in_model_order(self, values: np.ndarray) -> np.ndarray:
-        """Return the parameters in the order of the SensorModel."""
-        known = dict(zip(self.param_names, values)) | dict.fromkeys(UPPER, 0.0)
-        return np.array([known[name] for name in self.model.param_names])
+        return replace(self, model=self.model.at(values))
 
     def further(self, sensor: str, values: np.ndarray, force: np.ndarray, *, rate: np.ndarray, time: np.ndarray | None = None,
                 temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +139,7 @@ class HandModel:
         if not effects:
             return output, columns[0]
         ref = _reference(force, rate, time, temperature_c, self.gravity)
-        point, own = self.model.full_point(), self.model.values_of(sensor, self.in_model_order(values))
+        point, own = self.model.full_point(), self.model.values_of(sensor, values)
         for effect in effects:
             basis = {group.name: group.columns(ref, point) for group in effect.groups}
             coefficients, slopes = effect_slopes(effect, own, point)
@@ -165,7 +150,7 @@ class HandModel:
     def compensate(self, values: np.ndarray, force: np.ndarray, rate: np.ndarray, *, time: np.ndarray | None = None,
                    temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return true specific force and rate for readings of shape (m, 3)."""
-        bias_f, matrix_f, bias_w, matrix_w = unpack(values)
+        bias_f, matrix_f, bias_w, matrix_w = self.linear(values)
         true_f, true_w = np.linalg.solve(matrix_f, (force - bias_f).T).T, np.linalg.solve(matrix_w, (rate - bias_w).T).T
         for _ in range(REPEATS if self.extras else 0):
             more_f, more_w = (self.further(s, values, true_f, rate=true_w, time=time, temperature_c=temperature_c)[0] for s in SENSORS)
@@ -186,14 +171,13 @@ class HandModel:
             Shape (k,).
 
         """
-        _, matrix, *_ = unpack(values)
+        matrix = self.linear(values)[1]
         true = self.compensate(values, force, np.zeros_like(force), time=time, temperature_c=temperature_c)[0]
         norm = np.linalg.norm(true, axis=1)
         back = np.linalg.solve(matrix.T, (true / norm[:, None]).T).T
         columns = np.zeros((len(force), self.size))
         columns[:, 0:3] = back
-        for place, (i, j) in enumerate(LOWER, 3):
-            columns[:, place] = back[:, i] * true[:, j]
+        columns[:, 3:12] = (back[:, :, None] * np.tril(true[:, None].repeat(3, axis=1))).reshape(-1, 9)
         slopes = self.further('accelerometer', values, true, rate=np.zeros_like(true), time=time, temperature_c=temperature_c)[1]
         columns[:, self.extra_index('accelerometer')] = np.einsum('ki,kip->kp', back, slopes)
         return norm - self.gravity, columns

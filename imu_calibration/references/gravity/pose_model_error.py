@@ -7,7 +7,7 @@ from imu_calibration.estimation.model_error import LEAST_BLOCKS, ModelError, Wav
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.variance_components import GroupVariances
 from imu_calibration.references.gravity.equations import Poses, State, TurnData, build_system
-from imu_calibration.references.gravity.hand_parameters import GYRO_BIAS, GYRO_MATRIX, HandModel
+from imu_calibration.references.gravity.hand_parameters import HandModel
 
 
 def hand_model_error(model: HandModel, state: State, poses: Poses, *, turns: list[TurnData], scatter: GroupVariances,
@@ -35,7 +35,7 @@ def hand_model_error(model: HandModel, state: State, poses: Poses, *, turns: lis
     if count < LEAST_BLOCKS or not free.any():
         return ModelError(np.ones(model.size), *np.zeros((2, model.size)))
     system = build_system(model, state, poses, turns=turns)
-    spare = np.isin(system.component, (0, 2)).sum() - 2 * count - free.sum() + free[GYRO_BIAS].sum()
+    spare = np.isin(system.component, (0, 2)).sum() - 2 * count - free.sum() + free[model.gyro_bias].sum()
     if spare < LEAST_BLOCKS:   # parts that are fitted almost exactly have no scatter to compare
         return ModelError(np.ones(model.size), *np.zeros((2, model.size)))
     root = np.sqrt(scatter.total(system.noise, system.component))
@@ -50,17 +50,10 @@ def hand_model_error(model: HandModel, state: State, poses: Poses, *, turns: lis
     moved = np.einsum('kmp,m->kp', weighted, rest) @ covariance
     seen = np.einsum('mb,kmp->kbp', basis, weighted)
     expected = covariance @ (np.einsum('kmp,kmq->kpq', weighted, weighted) - np.einsum('kbp,kbq->kpq', seen, seen)) @ covariance
-    return errors_of_waves(Waves(np.flatnonzero(free), moved, expected, covariance=covariance), model.size, groups=_groups(model))[0]
+    return errors_of_waves(Waves(np.flatnonzero(free), moved, expected, covariance=covariance), model.model)[0]
 
 
 def _pose_of_rows(count, turns):
     """Return the pose of each row of `build_system`; a turn counts with the pose that it begins in, one of known angle with the last."""
     of_turns = [np.full(2, turn.first) if turn.rotation is None else np.full(3, count - 1) for turn in turns]
     return np.concatenate([np.tile(np.repeat(np.arange(count), 3), 3), *of_turns]).astype(int)
-
-
-def _groups(model):
-    """Return sensor -> runs of parameters, one for each effect."""
-    further = {sensor: [part for (own, _), part in model.parts.items() if own == sensor] for sensor in ('accelerometer', 'gyroscope')}
-    return {'accelerometer': [slice(0, 3), slice(3, 9), *further['accelerometer']],
-            'gyroscope': [GYRO_BIAS, GYRO_MATRIX, *further['gyroscope']]}

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
+from imu_calibration.effects.base import Role
 from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, EARTH_RATE, GRAVITY, HELD, NOISE, Terms
 from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.estimation.scaled_solve import covariance_with_held
 from imu_calibration.estimation.variance_components import GroupVariances, estimate_group_variances
 from imu_calibration.references.gravity.equations import Poses, State, TurnData, build_system, moved
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
-from imu_calibration.references.gravity.hand_parameters import ACCELEROMETER, GYRO_BIAS, LOWER, HandModel, unpack
+from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.pose_model_error import hand_model_error
 
 ITERATIONS = 15
@@ -62,32 +63,31 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
     """
     memory, priors = {}, model.priors
     state = first_state(model, poses)
-    every = np.ones(model.size, bool)
-    state, scatter, steps = _iterate(model, state, poses, turns, every, priors, fallback, fallback, memory)
-    held = choose_held(_factor(model, state, poses, turns, scatter, memory), priors)
+    state, scatter, steps = _iterate(model, state, poses, turns, ~model.fixed, priors, fallback, fallback, memory)
+    held = choose_held(_factor(model, state, poses, turns, scatter, memory), priors, ~model.fixed)
+    free = ~(held | model.fixed)
     state = State(np.where(held, model.nominal, state.values), state.up, state.drift)
     start = np.maximum(scatter.variance, 0.01 * fallback)
-    state, scatter, more = _iterate(model, state, poses, turns, ~held, LOOSE * priors, start, fallback, memory)
+    state, scatter, more = _iterate(model, state, poses, turns, free, LOOSE * priors, start, fallback, memory)
     factor = _factor(model, state, poses, turns, scatter, memory)
-    error = hand_model_error(model, state, poses, turns=turns, scatter=scatter, free=~held)
-    own, of_held = covariance_with_held(factor, ~held, held, prior_sd=priors)
-    scattered = _of_scatter(model, state, poses, turns=turns, scatter=scatter, free=~held, memory=memory)
+    error = hand_model_error(model, state, poses, turns=turns, scatter=scatter, free=free)
+    own, of_held = covariance_with_held(factor, free, held, prior_sd=priors)
+    scattered = _of_scatter(model, state, poses, turns=turns, scatter=scatter, free=free, memory=memory)
     terms = {NOISE: own - scattered, BIAS_PROCESS: scattered, HELD: of_held, **error.terms(own + of_held),
-             GRAVITY: _of_gravity(state.values, gravity_sd / model.gravity), EARTH_RATE: _of_earth(model, state, poses, ~held)}
+             GRAVITY: _of_gravity(model, state.values, gravity_sd / model.gravity), EARTH_RATE: _of_earth(model, state, poses, free)}
     return HandSolution(state, terms, held, scatter, factor, steps + more, error)
 
 
-def choose_held(factor: np.ndarray, priors: np.ndarray) -> np.ndarray:
+def choose_held(factor: np.ndarray, priors: np.ndarray, asked: np.ndarray) -> np.ndarray:
     """
-    Return the parameters with next to no information from the data, shape (n,).
+    Return which of the parameters `asked` (mask) have next to no information from the data, shape (n,).
 
     One after the other, the parameter whose sd (given those fixed so far) is largest in units of the prior's, while that
     exceeds one half.
 
     """
     held = np.zeros(len(priors), bool)
-    while not np.all(held):
-        free = ~held
+    while np.any(free := asked & ~held):
         ratio = np.zeros(len(priors))
         ratio[free] = _data_sd(factor[:, free] * priors[free])
         worst = int(np.argmax(ratio))
@@ -106,17 +106,18 @@ def _data_sd(scaled):
 def first_state(model: HandModel, poses: Poses) -> State:
     """Return a `State` from the norms in poses, which determine directions too, and the rates at rest."""
     values, nominal, priors, gravity = model.nominal.copy(), model.nominal, model.priors, model.gravity
+    own = model.base_index('accelerometer')
     for _ in range(ITERATIONS):
         residual, columns = model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
-        rows = np.vstack([columns[:, ACCELEROMETER] / (1e-3 * gravity), np.diag(1 / priors[ACCELEROMETER])])
-        target = np.concatenate([residual / (1e-3 * gravity), (nominal - values)[ACCELEROMETER] / priors[ACCELEROMETER]])
+        rows = np.vstack([columns[:, own] / (1e-3 * gravity), np.diag(1 / priors[own])])
+        target = np.concatenate([residual / (1e-3 * gravity), (nominal - values)[own] / priors[own]])
         step = np.linalg.lstsq(rows, target, rcond=None)[0]
-        values[ACCELEROMETER] += step
+        values[own] += step
         if np.max(np.abs(step)) < 1e-10:
             break
-    bias, matrix, *_ = unpack(values)
+    bias, matrix, *_ = model.linear(values)
     true = np.linalg.solve(matrix, (poses.force - bias).T).T
-    values[GYRO_BIAS] = poses.rate.mean(0)
+    values[model.gyro_bias] = poses.rate.mean(0)
     return State(values, true / np.linalg.norm(true, axis=1, keepdims=True), np.zeros_like(poses.rate))
 
 
@@ -165,10 +166,10 @@ def _of_scatter(model, state, poses, *, turns, scatter, free, memory):
     return found
 
 
-def _of_gravity(values, relative_sd):
+def _of_gravity(model, values, relative_sd):
     """Return the contribution of a wrong gravity to the covariance: poses at rest determine only matrix / gravity."""
-    common = np.zeros(len(values))
-    common[3:3 + len(LOWER)] = values[3:3 + len(LOWER)]
+    common, part = np.zeros(len(values)), model.model.part('accelerometer', Role.LINEAR)
+    common[part] = values[part]
     return relative_sd**2 * np.outer(common, common)
 
 
@@ -176,7 +177,7 @@ def _of_earth(model, state, poses, free):
     """Return the contribution of the Earth's rate about the vertical to the covariance, through biases and responses to gravity."""
     slopes = model.further('gyroscope', state.values, model.gravity * state.up, rate=np.zeros_like(state.up), time=poses.time,
                            temperature_c=poses.temperature_c)[1]
-    own = np.concatenate([np.arange(GYRO_BIAS.start, GYRO_BIAS.stop), model.extra_index('gyroscope')]).astype(int)
+    own = np.concatenate([np.arange(model.size)[model.gyro_bias], model.extra_index('gyroscope')])
     columns = np.concatenate([np.broadcast_to(np.eye(3), (len(slopes), 3, 3)), slopes], axis=2).reshape(-1, len(own))
     taken, kept = np.zeros(model.size), own[free[own]]
     taken[kept] = np.linalg.lstsq(columns[:, free[own]], EARTH_UPWARDS_SD * state.up.ravel(), rcond=None)[0]
