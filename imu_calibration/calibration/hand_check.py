@@ -4,16 +4,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from imu_calibration.calibration.hand_proof import PER_TURN, TURNS_LEAST, turn_error
+from imu_calibration.calibration.hand_proof import PER_TURN, TURNS_LEAST, entry_of, turn_error
 from imu_calibration.calibration.hand_workflow import read_by_hand
-from imu_calibration.calibration.proof import compared
 from imu_calibration.calibration.table_calibration import CheckResult
 from imu_calibration.compensation.stream import compensate_readings
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.effects.base import UNIT
+from imu_calibration.effects.base import SENSORS, UNIT
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.references.gravity.hand_calibration import HandData, gather_by_hand
@@ -66,9 +65,8 @@ def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gra
     ranges = [slice(start, stop) for start, stop in zip(poses.start, poses.stop, strict=True)]
     (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))
     rested = float(np.sum(poses.stop - poses.start) * poses.period)
-    norms = _entry(*(np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force)), unit=UNIT['accelerometer'],
-                   seconds=rested)
-    rest = _entry(raw_rate, rate, unit=UNIT['gyroscope'], seconds=rested)
+    lengths = (np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force))
+    norms, rest = (entry_of(errors, UNIT[sensor]) | {'seconds': rested} for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate))))
     proof = {'accelerometer': norms | {'regimes': {'rest': norms}}, 'gyroscope': rest | {'regimes': {'rest': rest}}}
     if len(turns) >= TURNS_LEAST:
         up = force / np.linalg.norm(force, axis=1, keepdims=True)
@@ -76,16 +74,10 @@ def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gra
         errors = (np.array([[turn_error(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up=up)]
                             for turn in turns])
                   for imu in (before, after))
-        angles = _entry(*errors, unit=PER_TURN, seconds=float(sum(turn.time[-1] - turn.time[0] for turn in turns)))
+        angles = entry_of(errors, PER_TURN) | {'seconds': float(sum(turn.time[-1] - turn.time[0] for turn in turns))}
         proof['gyroscope'] = angles | {'regimes': {'rest': rest, 'turns': angles}}
     return proof
 
 
 def _means(imu, ranges):
     return tuple(np.array([np.nanmean(values[part], axis=0) for part in ranges]) for values in (imu.force_s, imu.rate_s))
-
-
-def _entry(before, after, *, unit, seconds):
-    """Return an entry of a proof, of errors of shape (n, components)."""
-    found = compared(*((errors**2).sum(axis=1) for errors in (before, after)), np.ones(len(before)), components=before.shape[1])
-    return found | {'unit': unit, 'windows': len(before), 'seconds': seconds}

@@ -1,6 +1,6 @@
 """Evaluation of a calibration by hand on held-out poses and turns."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
@@ -54,22 +54,43 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
     for out, without in held_out_values(hand, turns, settings):
         values, part = applied_values(model.model, without, uncorrected.centre), _selected(poses, out & judged)
         left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last]) and judged[turn.first]]
-        norms.append([(np.linalg.norm(_corrected(model, each, part.force, np.zeros_like(part.force), part.temperature_c).force, axis=1)
-                       - hand.gravity)**2 for each in (plain, values)])
+        norms.append([np.linalg.norm(_corrected(model, each, part.force, np.zeros_like(part.force), part.temperature_c).force, axis=1)
+                      - hand.gravity for each in (plain, values)])
         if left and len(turns) - len(left) >= TURNS_LEAST:
-            angles.append([_missed(model, values, poses, left, gyroscope)**2 for gyroscope in (plain, values)])
+            angles.append([_missed(model, values, poses, left, gyroscope) for gyroscope in (plain, values)])
     if not norms:
         return {}
-    proof = {'accelerometer': _entry(norms, 'm/s^2')}
+    proof = {'accelerometer': entry_of(_joined(norms), 'm/s^2')}
     if sum(part[0].size for part in angles) >= TURNS_LEAST:
-        proof['gyroscope'] = _entry(angles, PER_TURN)
+        proof['gyroscope'] = entry_of(_joined(angles), PER_TURN)
     return proof
 
 
 def held_out_values(hand: HandCalibration, turns: Sequence[TurnData], settings: ByHandSettings) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return (mask of the held-out poses, parameters estimated without them) of each fold; none with too few poses."""
-    known = _Rows(hand, turns)
-    return [(out, known.values_without(out)) for out in _folds(hand.poses, settings)]
+    folds = _folds(hand.poses, settings)
+    return list(zip(folds, values_without(hand, turns, folds)))
+
+
+def values_without(hand: HandCalibration, turns: Sequence[TurnData], folds: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the parameters without the poses of each mask and the turns that begin or end there: one Gauss-Newton step."""
+    model, count = hand.model, len(hand.poses.start)
+    system = build_system(model, hand.state, hand.used_poses, turns=turns)
+    scatter = np.array([*(hand.statistics[f'{name}_scatter_sd']**2 for name in COMPONENTS), 0.0])
+    free = ~(np.array(hand.statuses) == HELD) & ~model.fixed
+    rows = np.column_stack([system.nuisance, system.main[:, free], system.residual])
+    rows /= np.sqrt(system.noise + scatter[system.component])[:, None]
+    ends = [(turn.first, turn.last) if turn.rotation is None else (count, count) for turn in turns
+            for _ in range(2 if turn.rotation is None else 3)]
+    poses = np.concatenate([np.tile(np.repeat(np.arange(count), 3)[:, None], (3, 2)), np.array(ends, int).reshape(-1, 2)])
+    prior = np.column_stack([np.diag(1.0 / model.priors), (model.nominal - hand.values) / model.priors])[free][:, np.append(free, True)]
+    known, found = np.pad(prior, ((0, 0), (system.nuisance.shape[1], 0))), []
+    for out in folds:
+        kept = np.concatenate([rows[~np.append(out, False)[poses].any(axis=1)], known])
+        moved = hand.values.copy()
+        moved[free] += scaled_lstsq(kept[:, :-1], kept[:, -1])[-len(prior):]
+        found.append(moved)
+    return found
 
 
 def _folds(poses, settings):
@@ -93,35 +114,16 @@ def uncorrected_by_hand(hand: HandCalibration) -> Uncorrected:
     return uncorrected_in_time(hand.model.model.at(values), values, hand.poses.time, end=end_by_hand(hand.poses))
 
 
-class _Rows:
-    """The weighted equations at the solution, each row with its poses."""
-
-    def __init__(self, hand, turns):
-        model, count = hand.model, len(hand.poses.start)
-        system = build_system(model, hand.state, hand.used_poses, turns=turns)
-        scatter = np.array([*(hand.statistics[f'{name}_scatter_sd']**2 for name in COMPONENTS), 0.0])
-        weight = 1.0 / np.sqrt(system.noise + scatter[system.component])
-        self.values, self.free = hand.state.values, ~(np.array(hand.statuses) == HELD) & ~model.fixed
-        self.rows = np.column_stack([system.nuisance, system.main[:, self.free], system.residual]) * weight[:, None]
-        ends = [(turn.first, turn.last) if turn.rotation is None else (count, count) for turn in turns
-                for _ in range(2 if turn.rotation is None else 3)]
-        self.poses = np.concatenate([np.tile(np.repeat(np.arange(count), 3)[:, None], (3, 2)), np.array(ends, int).reshape(-1, 2)])
-        prior = np.diag(1.0 / model.priors)[self.free][:, self.free]
-        self.known = np.column_stack([np.zeros((len(prior), system.nuisance.shape[1])), prior,
-                                      ((model.nominal - self.values) / model.priors)[self.free]])
-
-    def values_without(self, out):
-        """Return the parameters without some poses and the turns that begin or end there."""
-        rows = self.rows[~np.append(out, False)[self.poses].any(axis=1)]
-        rows = np.concatenate([rows, self.known])
-        values = self.values.copy()
-        values[self.free] += scaled_lstsq(rows[:, :-1], rows[:, -1])[-int(self.free.sum()):]
-        return values
+def _joined(folds):
+    """Return errors before and after of all folds, each shape (n, 1)."""
+    return [np.concatenate(side)[:, None] for side in zip(*folds)]
 
 
-def _entry(parts, unit):
-    before, after = (np.concatenate(side) for side in zip(*parts))
-    return compared(before, after, np.ones(len(before)), components=1) | {'unit': unit, 'windows': len(before)}
+def entry_of(errors: Iterable[np.ndarray], unit: str) -> dict:
+    """Return an entry of a proof, of the errors before and after, each shape (n, components)."""
+    before, after = errors
+    found = compared((before**2).sum(axis=1), (after**2).sum(axis=1), np.ones(len(before)), components=before.shape[1])
+    return found | {'unit': unit, 'windows': len(before)}
 
 
 def _selected(poses, mask):
