@@ -13,7 +13,7 @@ from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.estimation.scaled_solve import scaled_lstsq
 from imu_calibration.estimation.status import HELD
 from imu_calibration.kinematics.strapdown import integrate_turn
-from imu_calibration.references.gravity.equations import COMPONENTS, Poses, TurnData, between_middles, build_system
+from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, TurnData, between_middles
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_options import ByHandSettings
 from imu_calibration.references.gravity.poses import distinct_attitudes
@@ -74,19 +74,16 @@ def held_out_values(hand: HandCalibration, turns: Sequence[TurnData], settings: 
 
 def values_without(hand: HandCalibration, turns: Sequence[TurnData], folds: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the parameters without the poses of each mask and the turns that begin or end there: one Gauss-Newton step."""
-    model, count = hand.model, len(hand.poses.start)
-    system = build_system(model, hand.state, hand.used_poses, turns=turns)
+    model = hand.model
+    system = GravityRows(model, hand.used_poses, turns).linearise(hand.state)
     scatter = np.array([*(hand.statistics[f'{name}_scatter_sd']**2 for name in COMPONENTS), 0.0])
     free = ~(np.array(hand.statuses) == HELD) & ~model.fixed
     rows = np.column_stack([system.nuisance, system.main[:, free], system.residual])
     rows /= np.sqrt(system.noise + scatter[system.component])[:, None]
-    ends = [(turn.first, turn.last) if turn.rotation is None else (count, count) for turn in turns
-            for _ in range(2 if turn.rotation is None else 3)]
-    poses = np.concatenate([np.tile(np.repeat(np.arange(count), 3)[:, None], (3, 2)), np.array(ends, int).reshape(-1, 2)])
     prior = np.column_stack([np.diag(1.0 / model.priors), (model.nominal - hand.values) / model.priors])[free][:, np.append(free, True)]
     known, found = np.pad(prior, ((0, 0), (system.nuisance.shape[1], 0))), []
     for out in folds:
-        kept = np.concatenate([rows[~np.append(out, False)[poses].any(axis=1)], known])
+        kept = np.concatenate([rows[~np.append(out, False)[system.group].any(axis=1)], known])
         moved = hand.values.copy()
         moved[free] += scaled_lstsq(kept[:, :-1], kept[:, -1])[-len(prior):]
         found.append(moved)

@@ -9,6 +9,7 @@ where the shifts exceed it significantly, the covariance grows.
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 
 from imu_calibration.core.distributions import chi2_sf, f_sf
 from imu_calibration.effects.base import SENSORS, Role
@@ -16,6 +17,7 @@ from imu_calibration.effects.forward_equations import coefficient_jacobian, coef
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.covariance_terms import DRIFT, MODEL_ERROR
 from imu_calibration.estimation.noise_model import NoiseModel, dof_factor
+from imu_calibration.estimation.row_estimate import RowEstimate, RowSet
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.weighted_system import WeightedSystem
 
@@ -136,14 +138,46 @@ def slow_cosines(count: int) -> np.ndarray:
     return np.sqrt(2) * np.cos(np.pi * number[:, None] * (np.arange(count) + 0.5) / count)
 
 
-def _waves_of_blocks(information, gradient, prior_root, free):
-    """Return the Waves of independent parts with their own information and gradient."""
+def model_error_of_rows(rows: RowSet, found: RowEstimate, model: SensorModel, *, block: np.ndarray) -> ModelError:
+    """
+    Return the model error from the scatter of parameters between blocks of rows, beyond noise and known scatter.
+
+    Nuisances are estimated too, so that the expected covariance of the shifts is the one of rows from which these, and the parameters,
+    have been fitted.
+
+    Parameters
+    ----------
+    rows : RowSet
+        At the estimate.
+    found : RowEstimate
+    model : SensorModel
+        Its parameters are those of the rows.
+    block : array of int, shape (m,)
+        Number of each row's block.
+
+    """
+    root = np.sqrt(found.scatter.total(rows.noise, rows.component))[:, None]
+    fitted, rest = scipy.linalg.qr(rows.nuisance / root, mode='economic')[0], rows.residual / root[:, 0]
+    main = rows.main / root
+    main -= fitted @ (fitted.T @ main)
+    parts = [(main[own], rest[own], fitted[own]) for own in block == np.arange(block.max() + 1)[:, None]]
+    waves = _waves_of_blocks(np.array([part.T @ part for part, *_ in parts]), np.array([part.T @ error for part, error, _ in parts]),
+                             np.zeros((0, len(found.free))), found.free, shared=np.array([along.T @ part for part, _, along in parts]))
+    return errors_of_waves(waves, model)[0]
+
+
+def _waves_of_blocks(information, gradient, prior_root, free, shared=None):
+    """Return the Waves of parts with their own information and gradient; `shared`: products of their fitted nuisances with the design."""
     information, gradient = information[:, free][:, :, free], gradient[:, free]
     covariance = inverse_normal(information.sum(axis=0) + prior_root[:, free].T @ prior_root[:, free])
     weights = slow_cosines(len(information))
     mixed = np.einsum('kc,cij->kij', weights, information)
     squared = np.einsum('kc,cij->kij', weights**2, information)
-    expected = covariance @ (squared - mixed @ covariance @ mixed) @ covariance
+    expected = squared - mixed @ covariance @ mixed
+    if shared is not None:
+        along = np.einsum('kc,cdi->kdi', weights, shared[:, :, free])
+        expected -= along.transpose(0, 2, 1) @ along
+    expected = covariance @ expected @ covariance
     return Waves(np.flatnonzero(free), weights @ gradient @ covariance, expected, covariance=covariance)
 
 

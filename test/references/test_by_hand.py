@@ -17,7 +17,7 @@ from imu_calibration.estimation.variance_components import estimate_group_varian
 from imu_calibration.kinematics.rotations import normal_gravity
 from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.preprocessing.rest_detection import find_still
-from imu_calibration.references.gravity.equations import Poses, State, TurnData, build_system, moved
+from imu_calibration.references.gravity.equations import GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
 from imu_calibration.references.gravity.hand_options import ByHandSettings, HandOptions, KnownTurn, hand_options
@@ -99,13 +99,14 @@ def test_system_is_the_derivative_of_its_residuals():
     data = [time, rng.normal(0, 1, (100, 3)), np.tile(rng.normal(0, 9, 3), (100, 1))]
     known = TurnData(*data, rotation=np.array([0.1, 0.2, 0.9]), rotation_cov=np.diag([1, 2, 3.0]))
     turns = [TurnData(*data, 0, 1), TurnData(*data, 1, 2), known]
-    system = build_system(FULL, state, poses, turns=turns)
+    reference = GravityRows(FULL, poses, turns)
+    system = reference.linearise(state)
     design = np.hstack([system.nuisance, system.main])
     size = 1e-6
     slopes = []
     for step in size * np.eye(design.shape[1]):
         # rows at the true force: the response to the accelerometer's own parameters through the g-sensitivity is left out on purpose
-        ahead, behind = (build_system(FULL, moved(state, s * step, 3), poses, turns=turns).residual for s in (1, -1))
+        ahead, behind = (GravityRows(FULL, poses, turns).linearise(reference.moved(state, s * step)).residual for s in (1, -1))
         slopes.append(-(ahead - behind) / (2 * size))
     slopes = np.array(slopes).T
     accelerometer, fixed = np.arange(15, 27), 15 + np.flatnonzero(FULL.fixed)

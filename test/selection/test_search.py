@@ -207,6 +207,15 @@ def test_what_is_unexplained_where_an_effect_does_not_show_does_not_hide_it(with
     assert explained.share([QUADRATIC], QUADRATIC) == pytest.approx(share)
 
 
+@pytest.mark.parametrize(('least_part', 'share'), ((SHOWS, 1.0), (-np.inf, 0.5)))
+def test_an_effect_is_compared_with_the_excess_of_the_parts_in_which_it_counts(least_part, share):
+    """It removes the excess of turns; as much remains in poses, which by hand count too, because parts are few."""
+    explained = Explained(SimpleNamespace(used=len), lambda used: {'accelerometer': np.array([[1100.0], [100.0 if used else 1100.0]])},
+                          {'accelerometer': np.array([100.0, 100.0])}, least_part=least_part)
+    assert explained.share([QUADRATIC], QUADRATIC) == pytest.approx(share)
+    assert explained.rest([QUADRATIC]) == pytest.approx(1000.0)
+
+
 def alike(means, within):
     """Return an excess of the means and within windows of which each axis has a third."""
     return np.outer([means, within], np.full(3, 1 / 3))

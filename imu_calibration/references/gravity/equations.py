@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.row_estimate import RowSet
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -84,22 +85,6 @@ class State:
     """Departure of the gyroscope's bias in each pose, rad/s, shape (k, 3)."""
 
 
-@dataclass(frozen=True, eq=False)
-class System:
-    """Linearised equations ``residual = nuisance @ dn + main @ dp + error``, error of variance `noise` + `component`'s."""
-
-    residual: np.ndarray
-    """Measured minus predicted, shape (m,)."""
-    nuisance: np.ndarray
-    """Columns of directions (2 per pose) and drifts (3 per pose), shape (m, 5k)."""
-    main: np.ndarray
-    """Columns of the parameters, shape (m, n)."""
-    noise: np.ndarray
-    """Known variance of each row, shape (m,)."""
-    component: np.ndarray
-    """Index into `COMPONENTS`, or -1, shape (m,)."""
-
-
 def tangent(up: np.ndarray) -> np.ndarray:
     """Return two unit vectors orthogonal to each row of `up`, shape (k, 3, 2)."""
     helper = np.eye(3)[np.argmin(np.abs(up), axis=1)]
@@ -108,35 +93,38 @@ def tangent(up: np.ndarray) -> np.ndarray:
     return np.stack([one, np.cross(up, one)], axis=2)
 
 
-def moved(state: State, step: np.ndarray, n_poses: int) -> State:
-    """Return the state after a step (nuisance, then parameters)."""
-    turn = np.einsum('kij,kj->ki', tangent(state.up), step[:2 * n_poses].reshape(-1, 2))
-    up = state.up + turn
-    return State(state.values + step[5 * n_poses:], up / np.linalg.norm(up, axis=1, keepdims=True),
-                 state.drift + step[2 * n_poses:5 * n_poses].reshape(-1, 3))
+@dataclass(frozen=True, eq=False)
+class GravityRows:
+    """Poses, drifts of the bias and turns as rows of an estimate (`row_estimate.RowReference`)."""
 
+    model: HandModel
+    """Parameters."""
+    poses: Poses
+    """Means at rest."""
+    turns: Sequence[TurnData]
+    """Turns between them."""
+    memory: dict = field(default_factory=dict)
+    """Turns integrated before; for similar parameters they are corrected to first order instead of being integrated again."""
 
-def build_system(model: HandModel, state: State, poses: Poses, *, turns: Sequence[TurnData], memory: dict | None = None) -> System:
-    """
-    Stack the rows of poses, bias drifts and turns at the current state.
+    nominal = property(lambda self: self.model.nominal)
+    priors = property(lambda self: self.model.priors)
+    fixed = property(lambda self: self.model.fixed)
 
-    Parameters
-    ----------
-    model : HandModel
-    state : State
-    poses : Poses
-    turns : list of TurnData
-    memory : dict, optional
-        Turns integrated before; for similar parameters they are corrected to first order instead of being integrated again.
+    def moved(self, state: State, step: np.ndarray) -> State:
+        """Return the state after a step: 2 components per direction, 3 per drift, then the parameters."""
+        count = len(state.up)
+        up = state.up + np.einsum('kij,kj->ki', tangent(state.up), step[:2 * count].reshape(-1, 2))
+        return State(state.values + step[5 * count:], up / np.linalg.norm(up, axis=1, keepdims=True),
+                     state.drift + step[2 * count:5 * count].reshape(-1, 3))
 
-    """
-    memory = {} if memory is None else memory
-    across = tangent(state.up)
-    rows = [_pose_rows(model, state, poses, across), _drift_rows(model, state, poses), _calm_rows(model, state, poses)]
-    for key, turn in enumerate(turns):
-        rows.append(_gravity_turn_rows(model, state, turn, key, memory, across, poses) if turn.rotation is None
-                    else _known_turn_rows(model, state, turn))
-    return System(*(np.concatenate(parts) for parts in zip(*rows)))
+    def linearise(self, state: State) -> RowSet:
+        """Return the rows of poses, bias drifts, calm drifts and turns at a state."""
+        model, poses, across = self.model, self.poses, tangent(state.up)
+        rows = [_pose_rows(model, state, poses, across), _drift_rows(model, state, poses), _calm_rows(model, state, poses)]
+        for key, turn in enumerate(self.turns):
+            rows.append(_gravity_turn_rows(model, state, turn, key, self.memory, across, poses) if turn.rotation is None
+                        else _known_turn_rows(model, state, turn))
+        return RowSet(*(np.concatenate(parts) for parts in zip(*rows)))
 
 
 def _pose_rows(model, state, poses, across):
@@ -220,7 +208,7 @@ def _gravity_turn_rows(model, state, data, key, memory, across, poses):
     nuisance[:, 2 * j:2 * j + 2] -= (carried @ state.up[j]) * np.eye(2)
     for pose in (i, j):
         nuisance[:, 2 * count + 3 * pose:2 * count + 3 * pose + 3] += 0.5 * main[:, model.gyro_bias]
-    return -across_j.T @ carried, nuisance, main, np.full(2, data.noise_variance), np.full(2, 2)
+    return -across_j.T @ carried, nuisance, main, np.full(2, data.noise_variance), np.full(2, 2), np.tile([i, j], (2, 1))
 
 
 def _known_turn_rows(model, state, data):
@@ -236,7 +224,8 @@ def _known_turn_rows(model, state, data):
     impulse = np.einsum('m,mip->ip', np.diff(data.time), 0.5 * (further[1][:-1] + further[1][1:]))
     main[:, model.extra_index('gyroscope')] = -inverse @ impulse
     white = np.linalg.inv(np.linalg.cholesky(data.rotation_cov + data.noise_variance * np.eye(3)))
-    return (white @ (data.rotation - rotation), np.zeros((3, 5 * len(state.up))), white @ main, np.ones(3), np.full(3, -1))
+    count = len(state.up)
+    return white @ (data.rotation - rotation), np.zeros((3, 5 * count)), white @ main, np.ones(3), np.full(3, -1), np.full((3, 2), count)
 
 
 def _further_of_turn(model, state, data, bias):
@@ -248,4 +237,4 @@ def _further_of_turn(model, state, data, bias):
 
 def _flat(residual, nuisance, main, noise, component):
     return (residual.ravel(), nuisance.reshape(-1, nuisance.shape[-1]), main.reshape(-1, main.shape[-1]), noise.ravel(),
-            np.full(residual.size, component))
+            np.full(residual.size, component), np.repeat(np.arange(len(residual)), 3)[:, None].repeat(2, axis=1))

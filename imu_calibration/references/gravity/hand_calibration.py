@@ -215,10 +215,10 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     for effect in model.extras:
         if effect.time_constant and effect.name not in (point or {}):   # a time constant far from the prior does not converge from there
             trials = [replace(model, model=each) for each in at_time_constants(model.model, effect, float(poses.time[-1]))]
-            scatter = [solved(trial, poses, turns).scatter.variance[SENSORS.index(effect.sensor)] for trial in trials]
+            scatter = [solved(trial, poses, turns)[0].scatter.variance[SENSORS.index(effect.sensor)] for trial in trials]
             model = trials[int(np.argmin(scatter))]
     for _ in range(PASSES):
-        found = solved(model, poses, turns)
+        found, error = solved(model, poses, turns)
         settled, model = _settled(model, found), model.at(found.state.values)
         poses, turns, out = without_outliers(model, found, poses=poses, turns=turns)
         left |= {f'outlying {kind}': left.get(f'outlying {kind}', 0) + count for kind, count in out.items()}
@@ -227,7 +227,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     movements = bias_movements(model, found.state.values, poses)
     if 'accelerometer' in movements:
         poses = without_movement(poses, movements)
-        found = solved(model, poses, turns)
+        found, error = solved(model, poses, turns)
     terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
     used, poses = poses, data.poses   # the result has all poses unchanged, also excluded and drifting ones
     goals = tolerances_of(model.model, options.tolerances)
@@ -240,7 +240,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
         statistics['common_scale'] = {'sd': sd, 'tolerance': goal, 'status': str(statuses([sd], [False], [goal])[0])}
     return HandCalibration(tuple(model.model.param_names), found.state.values, terms, status, goals, model.priors, options.gravity,
                            dict(GAUGE), statistics, poses, found.state, model, found.factor.T @ found.factor, used, turns,
-                           found.model_error)
+                           error)
 
 
 def with_weak_replaced(hand: HandCalibration) -> HandCalibration:
@@ -292,7 +292,7 @@ def _statistics(model, found, poses, turns):
                      for values in (model.nominal, found.state.values))
     sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
     of_accelerometer = np.char.startswith(model.model.param_names, 'accelerometer')
-    spare = len(after) - int(np.sum(of_accelerometer & ~found.held & ~model.fixed))
+    spare = len(after) - int(np.sum(of_accelerometer & found.free))
     result = {'poses': len(poses.start), 'turns': len(turns), 'steps': found.steps,
               'norm_residual_rms_before': float(np.sqrt(np.mean(before**2))), 'norm_residual_rms': float(np.sqrt(np.mean(after**2))),
               'norm_chi2_per_dof': float(np.sum((after / sem)**2) / spare) if spare > 0 else None}

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.core.distributions import chance_of_fall
-from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State, TurnData, build_system
+from imu_calibration.estimation.row_estimate import RowEstimate
+from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.references.gravity.pose_solver import HandSolution
 from imu_calibration.references.gravity.turns_within_range import missed_angle
 
 P_VALUE = 1e-3
@@ -34,21 +34,23 @@ def possible_turns(model: HandModel, state: State, poses: Poses, *, turns: Seque
     return kept, len(turns) - len(kept)
 
 
-def without_outliers(model: HandModel, found: HandSolution, *, poses: Poses, turns: list[TurnData]) -> tuple[Poses, list[TurnData], dict]:
+def without_outliers(model: HandModel, found: RowEstimate, *, poses: Poses, turns: list[TurnData]) -> tuple[Poses, list[TurnData], dict]:
     """
     Return (poses, turns, {kind: number}) without outliers: leave-one-out F tests per kind, with Bonferroni correction.
 
     Excluded poses keep their place, with negligible weight.
     """
-    units = _units(poses, turns)
-    rest, leverage, component = _whitened(model, found, poses, turns)
-    left = {}
+    rows = GravityRows(model, poses, turns).linearise(found.state)
+    rest, leverage = _whitened(rows, found)
+    left, first, of_turn = {}, rows.group[:, 0], {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None}
     for kind in range(len(COMPONENTS)):
-        own = [(rows, index) for rows, index, group in units if group == kind]
-        total, spare = _distance(rest[component == kind], leverage[component == kind], 1e-3)
+        of_kind = rows.component == kind
+        index = of_turn if COMPONENTS[kind] == 'turn' else range(len(poses.start))
+        own = [(index[number], of_kind & (first == number)) for number in np.unique(first[of_kind])]
+        total, spare = _distance(rest[of_kind], leverage[of_kind], 1e-3)
         allowed = max(1, int(SHARE * len(own)))
-        worst = sorted((_p_value(rest[rows], leverage[rows], total, spare), index) for rows, index in own)
-        out = [index for p, index in worst[:allowed] if p * max(len(own), 1) < P_VALUE]
+        worst = sorted((_p_value(rest[at], leverage[at], total, spare), number) for number, at in own)
+        out = [number for p, number in worst[:allowed] if p * max(len(own), 1) < P_VALUE]
         if out:
             left[COMPONENTS[kind]] = out
     if left.get('pose'):
@@ -59,27 +61,13 @@ def without_outliers(model: HandModel, found: HandSolution, *, poses: Poses, tur
     return poses, turns, {kind: len(out) for kind, out in left.items()}
 
 
-def _units(poses, turns):
-    """Return (rows, index of the pose or turn, component) in the order of `build_system`: poses, rates at rest, calm drifts, turns."""
-    count = len(poses.start)
-    units = [(slice(3 * k, 3 * k + 3), k, 0) for k in range(count)]
-    units += [(slice(6 * count + 3 * k, 6 * count + 3 * k + 3), k, 1) for k in range(count)]
-    start = 9 * count
-    for index, turn in enumerate(turns):
-        if turn.rotation is None:
-            units.append((slice(start, start + 2), index, 2))
-        start += 2 if turn.rotation is None else 3
-    return units
-
-
-def _whitened(model, found, poses, turns):
-    """Return residuals in sds, an orthonormal basis of the fitted columns, and the component of each row."""
-    system = build_system(model, found.state, poses, turns=turns)
-    root = np.sqrt(found.scatter.total(system.noise, system.component))
-    design = np.hstack([system.nuisance, system.main[:, ~found.held]]) / root[:, None]
-    rest = system.residual / root
+def _whitened(rows, found):
+    """Return residuals in sds, and an orthonormal basis of the fitted columns."""
+    root = np.sqrt(found.scatter.total(rows.noise, rows.component))
+    design = np.hstack([rows.nuisance, rows.main[:, found.free]]) / root[:, None]
+    rest = rows.residual / root
     basis = np.linalg.qr(np.vstack([design, np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)]))[0][:len(rest)]
-    return rest - basis @ (basis.T @ rest), basis, system.component
+    return rest - basis @ (basis.T @ rest), basis
 
 
 def _distance(rest, basis, least):
