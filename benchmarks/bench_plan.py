@@ -27,7 +27,7 @@ from imu_calibration.effects.sensor_model import (
     NAMED_MODELS,  # noqa: E402
     SensorModel,  # noqa: E402
 )
-from imu_calibration.estimation.status import tolerances_of  # noqa: E402
+from imu_calibration.estimation.solution import tolerances_of  # noqa: E402
 from imu_calibration.kinematics.motion_limits import limits_of  # noqa: E402
 from imu_calibration.planning.belief import exact_information  # noqa: E402
 from imu_calibration.planning.coordinates import Coordinates  # noqa: E402

@@ -17,8 +17,8 @@ from sensor_msgs.msg import Imu  # noqa: E402
 from imu_calibration.core.samples import ImuSamples  # noqa: E402
 from imu_calibration.nodes import relay_loop  # noqa: E402
 from imu_calibration.nodes.inputs import input_qos, output_qos  # noqa: E402
-from msg_adapters.encode import encode_imu  # noqa: E402
 from msg_adapters.imu import find_imu_layout  # noqa: E402
+from msg_adapters.write import encode_imu  # noqa: E402
 
 ORIENTATION, STAMP_AT = 'orientation', 4
 END = 2.0**40

@@ -13,7 +13,7 @@ from imu_calibration.cli.show import console
 from imu_calibration.compensation import stream
 from imu_calibration.core.units import error_text, significant
 from imu_calibration.document import files
-from imu_calibration.estimation.status import LACKING
+from imu_calibration.estimation.solution import LACKING
 from imu_calibration.use_cases.recordings import source_of
 
 

@@ -203,7 +203,7 @@ def picture(path, watcher, calibration, errors):
     import matplotlib.pyplot as plt
 
     from imu_calibration.document.calibration_text import calibration_from_text
-    from imu_calibration.estimation.status import tolerances_of
+    from imu_calibration.estimation.solution import tolerances_of
     start = next(at for at, text, _ in watcher.drive if not text.startswith('idle'))
     figure, (known, errors_axes) = plt.subplots(2, 1, figsize=(9, 7), constrained_layout=True)
     usual, lines = files.read_tolerances(ROOT / 'config' / 'tolerances.yaml'), {}

@@ -13,10 +13,9 @@ from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.decode import FrameChoice, in_order
 from msg_adapters.definitions import is_standard, standard_definition
-from msg_adapters.encode import rows
 from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, patch_imu_group
-from msg_adapters.layout import group_by_layout
-from msg_adapters.stamps import MessageError, from_ns
+from msg_adapters.layout import MessageError, from_ns, group_by_layout
+from msg_adapters.write import rows
 
 
 def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike[str], imu_topic: str, *, corrected_topic: str,

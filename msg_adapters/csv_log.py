@@ -1,14 +1,18 @@
-"""Text logs (CSV) as recordings: columns and units are found from the header and, where the header has none, from the physics."""
+"""Logs as text with columns, read as a bag."""
 
 import csv
 import io
 import re
+import shutil
 import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
+from tempfile import mkdtemp
+from weakref import finalize
 
 import numpy as np
 
@@ -18,6 +22,8 @@ from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSa
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.preprocessing.full_scale import relate_turns
 from imu_calibration.preprocessing.scan import ChunkSeries
+from msg_adapters.rosbag2 import Rosbag2
+from msg_adapters.write import write_session
 
 SUFFIXES = ('.csv', '.tsv', '.txt')
 HEAD_BYTES = 1 << 16
@@ -357,3 +363,37 @@ def _rate_unit(stamp_ns, force_s, rate):
     if turning is None:
         return None
     return next((unit for unit, size in UNITS['rate'].items() if 1 / RATE_BAND < turning.factor / size < RATE_BAND), None)
+
+
+class CsvBag(Rosbag2):
+    """
+    A text log, converted into a temporary bag.
+
+    Raises
+    ------
+    InputError
+        When columns or units are ambiguous; `csv_log.read_csv` with explicit columns reads such a log.
+
+    """
+
+    def __init__(self, path: Path):
+        status = path.stat()
+        self.converted = _converted(path, status.st_mtime_ns, status.st_size)
+        super().__init__(self.converted.bag)
+        self.path = path
+
+
+class ConvertedLog:
+    """The temporary bag of a text log; its folder is removed with the last reference, or at exit."""
+
+    def __init__(self, path: Path):
+        log, folder = read_csv(path), mkdtemp(prefix='imu_calibration_')
+        finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        self.bag = Path(folder, path.stem)
+        write_session(self.bag, log.imu, log.joints, temperature=log.temperature, storage='mcap')
+
+
+@lru_cache(maxsize=1)
+def _converted(path, _modified_ns, _size):
+    """Return the ConvertedLog: a verb opens a recording several times, and converts an unchanged file once."""
+    return ConvertedLog(path)

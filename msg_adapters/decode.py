@@ -8,11 +8,20 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, imu_from_rows, imu_row
+from msg_adapters.imu import (
+    IMU_TYPE,
+    TEMPERATURE_TYPE,
+    decode_imu,
+    decode_temperature,
+    find_imu_layout,
+    find_temperature_layout,
+    imu_from_rows,
+    imu_row,
+    temperature_from_rows,
+    temperature_row,
+)
 from msg_adapters.joint_state import JOINT_STATE_TYPE, decode_joints, find_joint_layout, joint_row, joints_from_rows
-from msg_adapters.layout import Packed, group_by_layout
-from msg_adapters.stamps import MessageError, UnusableMessage, clean_name
-from msg_adapters.temperature import TEMPERATURE_TYPE, decode_temperature, find_temperature_layout, temperature_from_rows, temperature_row
+from msg_adapters.layout import MessageError, Packed, UnusableMessage, clean_name, group_by_layout
 
 JOINT_PATIENCE = 1000
 """So many JointState messages may pass before one fits the table."""

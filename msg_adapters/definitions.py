@@ -4,10 +4,8 @@ from collections.abc import Callable
 from itertools import count
 from typing import NamedTuple
 
-from msg_adapters.imu import IMU_TYPE
-from msg_adapters.joint_state import JOINT_STATE_TYPE
-from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE
-from msg_adapters.temperature import TEMPERATURE_TYPE
+from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
+from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE
 
 SEPARATOR = '=' * 80
 LONGEST, MOST_ELEMENTS = 100_000, 10_000

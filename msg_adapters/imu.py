@@ -1,4 +1,4 @@
-"""sensor_msgs/Imu: by attribute, by bytes one at a time, and many at once."""
+"""Imu and Temperature messages."""
 
 import struct
 from collections.abc import Sequence
@@ -6,9 +6,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from imu_calibration.core.samples import ImuSamples
-from msg_adapters.layout import MessageLayout, Packed, overlapping
-from msg_adapters.stamps import FRAME_OFFSET, MessageError, aligned, clean_name, header_stamp_ns, open_header
+from imu_calibration.core.samples import ImuSamples, TemperatureSamples
+from msg_adapters.layout import (
+    FRAME_OFFSET,
+    MessageError,
+    MessageLayout,
+    Packed,
+    aligned,
+    clean_name,
+    header_stamp_ns,
+    open_header,
+    overlapping,
+)
 
 IMU_TYPE = 'sensor_msgs/msg/Imu'
 
@@ -153,3 +162,33 @@ def _reframed(data, order, body, frame):
     new_body = aligned(FRAME_OFFSET + 4 + len(frame) + 1, 8)
     head = bytes(data[:FRAME_OFFSET]) + struct.pack(order + 'I', len(frame) + 1) + frame + b'\0'
     return head.ljust(new_body, b'\0') + bytes(data[body:]), new_body
+
+
+TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
+
+
+def find_temperature_layout(data: bytes) -> MessageLayout:
+    """Return the MessageLayout of a serialized Temperature message (raises MessageError)."""
+    header = open_header(data)
+    body = aligned(header.end, 8)
+    if len(data) < body + 16:
+        raise MessageError(f'a Temperature message with its doubles at byte {body} has {body + 16} bytes, got {len(data)}')
+    fixed = ((0, 2), (FRAME_OFFSET, header.end))
+    return MessageLayout(header.order, len(data), bytes(data), fixed, {'temperature_c': (body, 1)},
+                         (header.frame_id,))
+
+
+def decode_temperature(layout: MessageLayout, packed: Packed) -> TemperatureSamples:
+    """Decode messages of one layout into TemperatureSamples."""
+    return TemperatureSamples(layout.stamp_ns(packed), layout.column(packed, 'temperature_c')[:, 0])
+
+
+def temperature_row(message: Any) -> tuple[int, float]:
+    """Return (stamp_ns, temperature) of a message object of rclpy or rosbags."""
+    return header_stamp_ns(message), float(message.temperature)
+
+
+def temperature_from_rows(rows: Sequence[tuple[float, float]]) -> TemperatureSamples:
+    """Return TemperatureSamples from rows of `temperature_row`."""
+    stamp_ns, temperature_c = zip(*rows, strict=True)
+    return TemperatureSamples(np.array(stamp_ns, dtype=np.int64), np.array(temperature_c, dtype=float))

@@ -8,7 +8,7 @@ import numpy as np
 
 from imu_calibration.preprocessing.recording_evidence import QUANTITIES, MessageEvidence
 from msg_adapters.imu import find_imu_layout
-from msg_adapters.stamps import MessageError
+from msg_adapters.layout import MessageError
 
 STAMP_AT = 4
 HEAD_AT = 12

@@ -9,10 +9,8 @@ import numpy as np
 
 from imu_calibration.core.samples import SampleBlock
 from msg_adapters.decode import Decoder, JointDecoder, taken_counts
-from msg_adapters.imu import IMU_TYPE
-from msg_adapters.layout import Packed
-from msg_adapters.stamps import UnusableMessage, clean_name
-from msg_adapters.temperature import TEMPERATURE_TYPE
+from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
+from msg_adapters.layout import Packed, UnusableMessage, clean_name
 
 
 class LiveGatherer:

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from msg_adapters.compressed import LARGEST_CHUNK, decompress
-from msg_adapters.layout import Packed
-from msg_adapters.stamps import clean_name
+from msg_adapters.layout import Packed, clean_name
+from msg_adapters.mcap_records import LARGEST_CHUNK, decompress
 from msg_adapters.storage import Arrived
 
 STRETCH = 8192

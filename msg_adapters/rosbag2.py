@@ -11,9 +11,9 @@ from typing import Any
 from imu_calibration.core import documents
 from imu_calibration.core.documents import open_regular, parsed
 from imu_calibration.core.errors import InputError, shortened
-from msg_adapters.compressed import decompress_file, decompress_message
 from msg_adapters.definitions import TypeDefinition, is_standard, is_standard_name, standard_definition
-from msg_adapters.stamps import clean_name
+from msg_adapters.layout import clean_name
+from msg_adapters.mcap_records import decompress_file, decompress_message
 from msg_adapters.storages import STORAGES, suffixes
 
 _NAMES = {

@@ -14,9 +14,8 @@ from urllib.parse import quote
 import numpy as np
 
 from msg_adapters.definitions import TypeDefinition
-from msg_adapters.layout import Packed
+from msg_adapters.layout import Packed, clean_name
 from msg_adapters.sqlite_pages import PageReader
-from msg_adapters.stamps import clean_name
 from msg_adapters.storage import StorageFile, Stretch, read_ahead
 
 COLUMNS = ['id', 'topic_id', 'timestamp', 'data']

@@ -6,8 +6,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from msg_adapters.definitions import TypeDefinition
-from msg_adapters.mcap_file import McapFile
-from msg_adapters.mcap_writer import McapWriter
+from msg_adapters.mcap_file import McapFile, McapWriter
 from msg_adapters.sqlite_file import SqliteFile, SqliteWriter
 from msg_adapters.storage import Arrived, RawMessages
 

@@ -16,8 +16,8 @@ from imu_calibration.compensation.compensate import Transfer, compensate
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.nodes.processes import NodeProcesses, local_environment
 from msg_adapters.bag import open_recording
-from msg_adapters.encode import encode_imu
 from msg_adapters.imu import FIELDS, parse_imu
+from msg_adapters.write import encode_imu
 from validation.figures import new_figure
 from validation.recordings import load
 from validation.section import Section, text

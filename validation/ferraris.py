@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.estimation.status import LACKING
+from imu_calibration.estimation.solution import LACKING
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions, KnownTurn
 from validation.recordings import load, reference

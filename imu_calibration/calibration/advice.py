@@ -14,7 +14,7 @@ import numpy as np
 from imu_calibration.calibration.coverage import DIRECTIONS, excess, share_gained
 from imu_calibration.calibration.hand_step import TURNED, HandStep, steps_from, turn_rows
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.status import LACKING
+from imu_calibration.estimation.solution import LACKING
 from imu_calibration.references.gravity.equations import Poses
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_options import ByHandSettings

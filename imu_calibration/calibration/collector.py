@@ -27,9 +27,16 @@ from imu_calibration.preprocessing.stream_cleaning import Watcher
 from imu_calibration.preprocessing.window import Window, WindowSettings
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.references.turntable.gathered import KEPT_POSES, KEPT_SAMPLES, Gathered, naming
-from imu_calibration.references.turntable.held_out import HeldOut, HeldOutBlock
-from imu_calibration.references.turntable.window_store import WindowStore, owned_window
+from imu_calibration.references.turntable.gathered import (
+    KEPT_POSES,
+    KEPT_SAMPLES,
+    Gathered,
+    HeldOut,
+    HeldOutBlock,
+    WindowStore,
+    naming,
+    owned_window,
+)
 
 FORMAT = 'imu_calibration/accumulator/2'
 _MODEL = ('accelerometer', 'gyroscope', 'reference')

@@ -12,11 +12,10 @@ from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.observability import added_information
+from imu_calibration.estimation.observability import MOTIONS, TABLE_MOTIONS, added_information, rest_with_up
 from imu_calibration.estimation.prior import GAUGE_SD, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
-from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS, rest_with_up
-from imu_calibration.estimation.status import DETERMINED, LACKING
+from imu_calibration.estimation.solution import DETERMINED, LACKING
 
 
 class Progress(StrEnum):

@@ -12,7 +12,7 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import decisions_text
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.status import HELD
+from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 

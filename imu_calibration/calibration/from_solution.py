@@ -16,10 +16,9 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.covariance_terms import GRAVITY, REJECTED, replace_weak, with_term
+from imu_calibration.estimation.observability import Motion, motions_about
 from imu_calibration.estimation.prior import make_prior
-from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.standard_motions import Motion, motions_about
-from imu_calibration.estimation.status import reasons_held, statuses
+from imu_calibration.estimation.solution import Solution, reasons_held, statuses
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import CheckFinding

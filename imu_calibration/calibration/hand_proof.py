@@ -11,7 +11,7 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.uncorrected import LAST_SHARE, Uncorrected, uncorrected_in_time
 from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.estimation.scaled_solve import scaled_lstsq
-from imu_calibration.estimation.status import HELD
+from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, TurnData, between_middles
 from imu_calibration.references.gravity.hand_calibration import HandCalibration

@@ -18,7 +18,7 @@ from imu_calibration.document.verdict import judged
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.estimation.covariance_terms import GRAVITY
-from imu_calibration.estimation.status import HELD, reasons_held, statuses
+from imu_calibration.estimation.solution import HELD, reasons_held, statuses
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding

@@ -22,9 +22,8 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.stamping import StampLine
 from imu_calibration.preprocessing.window import Window, WindowSettings
 from imu_calibration.references.options import CalibrationOptions, choose_model
-from imu_calibration.references.turntable.gathered import Gathered, merge
-from imu_calibration.references.turntable.window_store import WindowStore
-from imu_calibration.selection.linearisation import linearise_again
+from imu_calibration.references.turntable.gathered import Gathered, WindowStore, merge
+from imu_calibration.selection.questions import linearise_again
 
 HELD_BACK = 200
 """Blocks that wait for the first temperature at most, when a thermal effect needs one."""

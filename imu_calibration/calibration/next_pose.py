@@ -9,7 +9,7 @@ from imu_calibration.calibration.coverage import DIRECTIONS, Coverage, Step
 from imu_calibration.calibration.hand_result import HandResult
 from imu_calibration.calibration.pose_scan import Findings
 from imu_calibration.effects.sensor_model import BASE, SensorModel
-from imu_calibration.estimation.status import LACKING, tolerances_of
+from imu_calibration.estimation.solution import LACKING, tolerances_of
 from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.hand_parameters import HandModel
 

@@ -9,7 +9,7 @@ from imu_calibration.calibration.session import SessionStatus
 from imu_calibration.core.errors import with_hint
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.estimation.status import COMMON_SCALE, LACKING
+from imu_calibration.estimation.solution import COMMON_SCALE, LACKING
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.gravity.equations import Poses

@@ -15,11 +15,11 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
 from imu_calibration.effects.forward_equations import Centre, applied_values, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.attitudes import one_attitude
-from imu_calibration.estimation.pieces import AXES, PIECE_TIME, Regime
+from imu_calibration.estimation.accumulator import one_attitude
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.window_statistics import AXES, PIECE_TIME, Regime
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.held_out import HeldOut
+from imu_calibration.references.turntable.gathered import HeldOut
 
 RESAMPLES = 1000
 """Resamples of complete blocks for an interval."""

@@ -11,7 +11,7 @@ from imu_calibration.core.units import ARCMIN
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import HELPS, Verdict, most_cautious
 from imu_calibration.document.trust import usage
-from imu_calibration.estimation.status import DETERMINED
+from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.gathered import Gathered

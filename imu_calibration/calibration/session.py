@@ -21,8 +21,7 @@ from imu_calibration.preprocessing.joint_checks import check_units
 from imu_calibration.preprocessing.stamping import StampLine
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.options import CalibrationOptions, choose_model
-from imu_calibration.references.turntable.gathered import Gathered
-from imu_calibration.references.turntable.window_store import WindowStore
+from imu_calibration.references.turntable.gathered import Gathered, WindowStore
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,18 +24,16 @@ from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import restrict
-from imu_calibration.estimation.solution import Solution, shrunk
+from imu_calibration.estimation.solution import Solution, shrunk, tolerances_of
 from imu_calibration.estimation.solver import solve
-from imu_calibration.estimation.status import tolerances_of
 from imu_calibration.estimation.window_statistics import reduce_window
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_units
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
-from imu_calibration.references.turntable.gathered import Gathered, join, naming
-from imu_calibration.references.turntable.held_out import HeldOut
-from imu_calibration.selection.linearisation import PASSES, at_time_constants, linearise_again
+from imu_calibration.references.turntable.gathered import Gathered, HeldOut, join, naming
+from imu_calibration.selection.questions import PASSES, at_time_constants, linearise_again
 
 
 def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,

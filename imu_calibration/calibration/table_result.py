@@ -36,7 +36,7 @@ from imu_calibration.kinematics.chain import tilt
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.references.turntable.held_out import HeldOut, HeldOutBlock
+from imu_calibration.references.turntable.gathered import HeldOut, HeldOutBlock
 
 MOVING_SAMPLES = 20_000
 """Most samples of moving windows that are used; they are subsampled evenly beyond it."""

@@ -18,7 +18,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Read, write, and list the parameters that the file lacks."""
-    from imu_calibration.estimation.status import HELD
+    from imu_calibration.estimation.solution import HELD
     from imu_calibration.use_cases.exporting import import_calibration
     found = import_calibration(options.file, options.source, output=options.output, frame_id=options.frame_id)
     held = [name for name, status in found.requested.items() if status == HELD]

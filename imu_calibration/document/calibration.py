@@ -15,7 +15,7 @@ from imu_calibration.document.decision import SensorDecision, Verdict, decide, d
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.covariance_terms import GRAVITY
-from imu_calibration.estimation.status import COMMON_SCALE, FIXED, HELD, LACKING, Status
+from imu_calibration.estimation.solution import COMMON_SCALE, FIXED, HELD, LACKING, Status
 
 UNKNOWN = 'unknown'
 """Entry of the provenance for the uncertainty of imported values."""

@@ -16,7 +16,7 @@ from imu_calibration.document.decision import HARMS, SensorDecision
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
 from imu_calibration.effects.sensor_model import BASE, SensorModel
-from imu_calibration.estimation.status import Status
+from imu_calibration.estimation.solution import Status
 from imu_calibration.kinematics.joint import JointNames
 
 CONDITION_LIMIT = 20.0

@@ -8,7 +8,7 @@ from scipy.special import chdtrc
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import Role
-from imu_calibration.estimation.status import HELD
+from imu_calibration.estimation.solution import HELD
 
 LEVEL = 0.01
 """Significance level: two calibrations differ when the p-value is below this."""

@@ -11,7 +11,7 @@ from imu_calibration.document.calibration import HAND_AXES, Calibration, beyond_
 from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN, decisions_text, reason_of
 from imu_calibration.document.uncorrected import uncorrected_lines
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.status import LACKING
+from imu_calibration.estimation.solution import LACKING
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,7 +90,7 @@ class Effect:
     title: str = ''
     """Heading in a report; derived from the name where empty."""
     motion: tuple
-    """Standard motions (`estimation.standard_motions`) that show it."""
+    """Standard motions (`estimation.observability`) that show it."""
     compensation: str
     """'exact' (inverted), 'flagged' (cannot be inverted, output marked) or 'none' (belongs to the table or the session)."""
     role: Role = Role.TERM

@@ -1,11 +1,134 @@
-"""Standard deviations of window offsets, of the bias process and of its steps between recordings: means over the restricted likelihood."""
+"""Search for the noise of rows by restricted likelihood: grid, variance components, bias processes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 
 from imu_calibration.estimation.noise_model import BiasProcess, dof_factor, means_beside_middles
-from imu_calibration.estimation.restricted_likelihood import RestrictedLikelihood, profile
+from imu_calibration.estimation.whitening import RestrictedLikelihood, profile
+
+STEPS = 2
+"""Scoring steps per call; for rows of one variance a single step is exact."""
+DOF_LEAST = 2.0
+"""With fewer degrees of freedom a group's variance is not estimated from the data."""
+DOF_SEPARATE = 3.0
+"""With fewer degrees of freedom the misfit of a group is not separable from that of the others."""
+ATTRIBUTION_STEPS = 6
+"""Scoring steps for the variance of one group if all misfit is its own."""
+SPARE_LEAST = 0.1
+"""With fewer degrees of freedom no misfit is attributed to a group."""
+UPPER = 0.975
+"""Probability of the quantile whose ratio between Student's t and the normal distribution widens standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroupVariances:
+    """Variances in addition to the known noise."""
+
+    variance: np.ndarray
+    """Additional variance of each group, shape (n_groups,)."""
+    dof: np.ndarray
+    """Degrees of freedom from which each was estimated, shape (n_groups,)."""
+    upper: np.ndarray
+    """Variance for standard deviations, which allows for the error of `variance`, shape (n_groups,)."""
+
+    def total(self, noise: np.ndarray, group: np.ndarray, inflated: bool = False) -> np.ndarray:
+        """
+        Return the variance of each row, shape (m,).
+
+        Parameters
+        ----------
+        noise : array, shape (m,)
+            Known variance.
+        group : array, shape (m,)
+            Group of each row, -1 for none.
+        inflated : bool
+            Use `upper`, so that 95 % intervals from few poses are correct.
+
+        """
+        return noise + np.append(self.upper if inflated else self.variance, 0.0)[group]
+
+
+def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np.ndarray, *, group: np.ndarray, start: np.ndarray,
+                             fallback: np.ndarray) -> GroupVariances:
+    """
+    Estimate the additional variance of each group of rows.
+
+    The rows are ``residual = design @ x + e`` with independent errors of variance ``noise + variance[group]``. Scoring on
+    the restricted likelihood, which charges for the parameters that were fitted.
+
+    Parameters
+    ----------
+    design : array, shape (m, p)
+        Columns; full column rank (add weak priors as rows of group -1 where needed).
+    residual, noise, group : arrays, shape (m,)
+        Left-hand side, known variance (above zero), index of the group or -1.
+    start : array, shape (n_groups,)
+        First guess of the variances.
+    fallback : array, shape (n_groups,)
+        Variance of a group with fewer than two degrees of freedom.
+
+    """
+    rows = np.column_stack([design, residual])[:, None]
+    problem = _Groups(RestrictedLikelihood(rows, np.zeros(len(rows)), [np.arange(len(rows))]), noise, group, len(start))
+    # at a large variance the degrees of freedom depend on the layout of the rows only
+    none, large = np.zeros(len(start), bool), 100 * (np.asarray(fallback, float) + problem.typical(np.zeros(len(start))))
+    spare = problem.step(large, none)[1]
+    free = spare >= DOF_LEAST
+    current = np.where(free, start, fallback)
+    for _ in range(STEPS):
+        typical, (changed, dof) = problem.typical(current), problem.step(current, free)
+        settled = np.all(np.abs(changed - current) <= 1e-3 * typical)
+        current = changed
+        if settled:
+            break
+    dof = np.where(free, dof, 0.0)
+    upper = current * np.where(dof > DOF_LEAST, student_factor(dof), 1.0)
+    for alone in np.eye(len(free), dtype=bool)[spare < DOF_SEPARATE]:
+        upper[alone] = np.maximum(upper[alone], _attributed(problem, alone, fallback)[alone])
+    return GroupVariances(current, dof, upper)
+
+
+def student_factor(dof: np.ndarray) -> np.ndarray:
+    """Return the squared ratio of the 97.5 % quantiles of Student's t with `dof` (at least 1) degrees of freedom and of the normal law."""
+    return (stdtrit(np.maximum(dof, 1.0), UPPER) / ndtri(UPPER))**2
+
+
+def _attributed(problem, alone, fallback):
+    """Return the variance of one group if all misfit is its own, at least `fallback`, widened by Student's t, shape (n_groups,)."""
+    least = np.where(alone, fallback, 0.0)
+    current, dof = problem.step(least, np.zeros(len(alone), bool))
+    for _ in range(ATTRIBUTION_STEPS if dof[alone] > SPARE_LEAST else 0):
+        current = problem.step(current, alone)[0]
+    current = np.where(alone, np.maximum(current, fallback), 0.0)
+    return current * student_factor(problem.step(current, np.zeros(len(alone), bool))[1])
+
+
+class _Groups:
+    """The likelihood as a function of the additional variances of groups."""
+
+    def __init__(self, likelihood, noise, group, count):
+        self.likelihood, self.noise, self.group = likelihood, noise, group
+        self.members = np.array([group == number for number in range(count)], float)
+
+    def variance(self, extra):
+        """Return the variance of each row."""
+        return self.noise + np.append(extra, 0.0)[self.group]
+
+    def typical(self, extra):
+        """Return the mean variance of each group's rows."""
+        return (self.members @ self.variance(extra)) / np.maximum(self.members.sum(1), 1)
+
+    def step(self, extra, free):
+        """Return the next variances, a scoring step over the free groups that are not pinned at zero, and each one's degrees of freedom."""
+        score, information = self.likelihood.scoring(self.variance(extra)[:, None], self.members)
+        index, step, typical = np.flatnonzero(free & ~((extra <= 0) & (score < 0))), np.zeros(len(extra)), self.typical(extra)
+        if len(index):
+            step[index] = np.linalg.solve(information[np.ix_(index, index)], score[index])
+        return np.clip(extra + step, 0.0, extra + 100 * typical), 2 * np.diag(information) * typical**2
+
 
 TYPICAL_TIME, TIME_SPREAD = 100.0, 0.8
 """Correlation times of MEMS biases: around 100 s, log-normal; a short session does not determine them (field catalogue, section 6)."""
@@ -181,3 +304,89 @@ def _posterior_mean(trials, costs):
     if moving.sum() <= 0:
         return float(offset), 0.0, TYPICAL_TIME
     return float(offset), float(bias), float(np.exp(moving @ np.log(trials[:, 2]) / moving.sum()))
+
+
+TIMES = (100.0, 300.0, 15.0, 40.0, 1000.0, FLICKER)
+"""Correlation times that are tried, s, and flicker; that of the natural process first."""
+NATURAL = 0.5
+"""Least sd of every bias process over the white noise of one second, with the first of these correlation times."""
+SPREAD = 0.8
+"""Prior sd of the logarithm of a bias process's sd over the natural one; much larger drifts are hardly a bias process."""
+OFFSETS = 10.0
+"""Price of offsets of windows: they are no noise of a sensor, and flicker scatters means of windows beyond a wander of 15 s as they do."""
+RATIOS = (0.0, *2.0 ** np.arange(-2.0, 8.5, 0.5))
+"""
+Standard deviations that are tried, in units of the typical noise of a window mean; between steps of two the likelihoods of other times lie.
+"""
+
+
+class BiasProcessSearch:
+    """
+    The best shape of the noise ``(offset sd, sd of the bias process, its correlation time)`` given a choice of parameters.
+
+    Parameters
+    ----------
+    likelihood : NoiseLikelihood
+    least : float
+        Least standard deviation of the bias process.
+    usual : float
+        The one up to which a larger one is as likely; the least one where that is larger.
+
+    """
+
+    def __init__(self, likelihood: NoiseLikelihood, least: float = 0.0, usual: float = 0.0):
+        self.likelihood, self.least, self.usual = likelihood, least / likelihood.typical, max(least, usual) / likelihood.typical
+
+    def best(self, used: Sequence[int]) -> tuple[tuple, float]:
+        """Return (shape, loss) of the best noise given the parameters `used`, standard deviations in units of the typical noise."""
+        def loss(shape):
+            return self.likelihood.loss(shape, used) + self.price(*shape[:2])
+
+        offset = _descend(lambda x: loss((x, self.least, TIMES[0])), RATIOS)
+        shapes = [(offset, self.least, TIMES[0])]
+        grid = (self.least,) + tuple(ratio for ratio in RATIOS if ratio > 1.2 * self.least)
+        if self.likelihood.many:
+            for time in TIMES:
+                bias = _descend(lambda x: loss((0.0, x, time)), grid)
+                shapes += [(_near(share * offset), bias, time) for share in (0.0, 0.25, 0.5, 1.0)]
+        shape = min(shapes, key=loss)
+        return shape, loss(shape)
+
+    def price(self, offset: float, bias: float) -> float:
+        """Return minus twice the log prior of offsets, relative to none, and of the sd of a bias, relative to the usual one."""
+        return OFFSETS * (offset > 0) + ((np.log(max(bias / self.usual, 1.0)) / SPREAD)**2 if self.least else 0.0)
+
+    def of_middle_axis(self, shape: tuple, used: Sequence[int]) -> float:
+        """Return the median over the axes of the likeliest sd of the bias process of each, with `shape` for the other axes."""
+        def likeliest(own):
+            offset = shape[0] * self.likelihood.typical / own.typical
+            return own.typical * _descend(lambda x: own.loss((offset, x, shape[2]), used), RATIOS)
+
+        return float(np.median([likeliest(self.likelihood.of_axis(axis, shape)) for axis in range(3)]))
+
+    def polished(self, shape: tuple, used: Sequence[int]) -> dict:
+        """Return the fields of `NoiseModel` that concern offsets, the standard deviations of a shape refined."""
+        offset, bias, time = shape
+        offset = _polish(lambda x: self.likelihood.loss((x, bias, time), used), offset)
+        bias = max(_polish(lambda x: self.likelihood.loss((offset, x, time), used) + self.price(offset, x), bias), self.least)
+        unit = self.likelihood.typical
+        return {'offset_sd': offset * unit, 'bias_processes': self.likelihood.processes(bias * unit, time)}
+
+
+def _near(ratio):
+    """Return the tried ratio that is nearest, so that shapes are met again."""
+    return min(RATIOS, key=lambda known: abs(known - ratio))
+
+
+def _descend(loss: Callable, grid):
+    """Return the grid value of least loss, going up until the loss has risen twice."""
+    losses = []
+    for value in grid:
+        losses.append(loss(value))
+        if len(losses) > 4 and losses[-1] > losses[-2] > losses[-3]:
+            break
+    return float(grid[losses.index(min(losses))])
+
+
+def _polish(loss: Callable, value):
+    return value if value == 0.0 else min([value * factor for factor in (0.7, 0.85, 1.0, 1.2, 1.4)], key=loss)

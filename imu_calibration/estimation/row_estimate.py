@@ -13,8 +13,8 @@ import numpy as np
 import scipy.linalg
 
 from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD, NOISE
+from imu_calibration.estimation.noise_search import GroupVariances, estimate_group_variances
 from imu_calibration.estimation.scaled_solve import covariance_with_held
-from imu_calibration.estimation.variance_components import GroupVariances, estimate_group_variances
 
 ITERATIONS = 15
 """Largest number of Gauss-Newton steps; four to six are usual."""

@@ -1,25 +1,168 @@
-"""Solution of the system: one weighted non-linear least-squares problem over all windows, with its covariance."""
+"""Weighted least squares over all windows: noise, outliers, held parameters, covariance."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from imu_calibration.core.distributions import chance_of_fall
 from imu_calibration.core.errors import NotObservableError
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import Accumulator
-from imu_calibration.estimation.attitudes import not_separable
-from imu_calibration.estimation.contradicted import contradicted
+from imu_calibration.estimation.accumulator import Accumulator, not_separable
 from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD, NOISE
 from imu_calibration.estimation.model_error import model_error
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
-from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, scaled_lstsq
+from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, inverse_normal, scaled_lstsq
 from imu_calibration.estimation.session_noise import first_noise, updated_noise
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.unbelievable import unbelievable
 from imu_calibration.estimation.weighted_system import WeightedSystem
 from imu_calibration.estimation.whitening import predict_session_offsets
+
+P_VALUE = 1e-3
+"""False positive rate per sensor and kind for a recording without outliers."""
+SHARE = 0.15
+"""Largest share of each kind that is excluded; a more frequent deviation is a property of the recording."""
+LEAST_SPARE = 9.0
+"""Residual degrees of freedom of the other windows of the kind that the test requires."""
+CANDIDATES = 8
+"""Windows of each kind under test per round, in order of their residual."""
+LEAST_SEEN = 0.05
+"""A window whose error keeps less than this share in the residuals is not tested."""
+
+
+def contradicted(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> dict[str, frozenset]:
+    """
+    Return sensor -> keys of the outlying windows by kind, without the ones that the noise model excludes already.
+
+    Mean-shift F test, one kind of window per round (the one with the least probable outlier), because with a bias process one outlier makes
+    its neighbours look inconsistent.
+
+    A separate offset for one window must improve the fit of the other windows significantly (F test with Bonferroni correction). The noise
+    may be overestimated because of that window; the factor is common to all windows and cancels in the ratio.
+
+    Parameters
+    ----------
+    system : WeightedSystem
+    values : ndarray, shape (n_params,)
+        The estimate.
+    noises : dict
+        Sensor -> NoiseModel of the estimate.
+
+    """
+    found, kinds = {}, np.array(system.kinds)
+    for sensor in SENSORS:
+        fit, out = _Fit.of(system, sensor, values, noises[sensor]), np.array([key in noises[sensor].left_out for key in system.keys])
+        worst = min((_of_kind(kinds == kind, out, fit) for kind in sorted(set(system.kinds))), key=lambda of_kind: of_kind[0])
+        found[sensor] = frozenset(system.keys[at] for at in worst[1])
+    return found
+
+
+def _of_kind(own: np.ndarray, out: np.ndarray, fit: '_Fit') -> tuple[float, list[int]]:
+    """Return (the smallest p-value, the numbers of the outliers among the windows `own`), without the windows `out`."""
+    count, kept = int(own.sum()), np.flatnonzero(own & ~out)
+    allowed = max(1, int(SHARE * count)) - (count - len(kept))
+    worst = kept[np.argsort(-(fit.rest[kept]**2).sum(axis=1), kind='stable')][:CANDIDATES] if allowed > 0 else []
+    found = sorted((fit.p_value(at, kept) * len(kept), at) for at in worst)[:allowed]
+    return found[0][0] if found else 1.0, [at for chance, at in found if chance < P_VALUE]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Whitened means of one sensor with the normal matrix of centred rows and prior."""
+
+    rest: np.ndarray
+    """Whitened residuals, shape (n_windows, 3)."""
+    design: np.ndarray
+    """Whitened columns, shape (n_windows, 3, q)."""
+    covariance: np.ndarray
+    """Of the parameters, shape (q, q)."""
+    whiten: Callable
+    """Function that whitens columns, shape (n_windows, 3, k)."""
+
+    @classmethod
+    def of(cls, system: WeightedSystem, sensor: str, values: np.ndarray, noise: NoiseModel) -> '_Fit':
+        rows, normal = system.linearised(sensor, values, noise)
+        white = system.whitened(rows, noise)
+        design, q = white[:, :, :-1], white.shape[2] - 1
+        return cls(white[:, :, -1], design, inverse_normal(normal[:q, :q] + np.einsum('kap,kaq->pq', design, design)),
+                   lambda columns: system.whitened(columns, noise))
+
+    def p_value(self, at: int, own: np.ndarray) -> float:
+        """Return the p-value of the improvement of the windows `own` by a separate offset for window `at`."""
+        one = np.zeros(self.rest.shape + (1,))
+        one[at] = 1.0
+        one = self.whiten(one)[:, :, 0]
+        along = np.einsum('kap,ka->ap', self.design, one)
+        seen = (one**2).sum(axis=0) - np.einsum('ap,pq,aq->a', along, self.covariance, along)
+        if np.any(seen < LEAST_SEEN * (one**2).sum(axis=0)):
+            return 1.0
+        size = (one * self.rest).sum(axis=0) / seen
+        better = self.rest - (one - np.einsum('kap,pq,aq->ka', self.design, self.covariance, along)) * size
+        leverage = np.einsum('kap,pq,kaq->ka', self.design[own], self.covariance, self.design[own]).sum()
+        spare = 3 * len(own) - leverage - 3
+        if spare < LEAST_SPARE:
+            return 1.0
+        total, others = ((part[own]**2).sum() for part in (self.rest, better))
+        return chance_of_fall(total - others, 3, rest=others, spare=spare)
+
+
+FAR = 3.0
+"""Prior standard deviations beyond which an entry of a matrix needs a reason that is not misfit."""
+
+REST_NOISE_MARGIN = 1.1
+"""Residuals up to this times the variance at rest are noise: the rest used for its estimate may have been quieter."""
+
+
+def unbelievable(system: WeightedSystem, values: np.ndarray, *, sd: np.ndarray, noises: dict[str, NoiseModel],
+                 free: np.ndarray) -> np.ndarray:
+    """
+    Return a mask of the parameters whose information may be an artefact of misfit.
+
+    The value exceeds the range of known instruments, and it is no larger than the shift that all excess misfit of moving windows causes
+    along the parameter. Example: an accelerometer's scale along an axis without gravity, determined only through arms and wrong angles.
+    A gyroscope at the wrong full-scale setting has a value larger than its misfit explains, and is kept. All parameters of an effect are
+    fixed, of a matrix single entries.
+
+    Parameters
+    ----------
+    system : WeightedSystem
+    values, sd : ndarray, shape (n_params,)
+        The estimate and its standard deviation from noise.
+    noises : dict
+        Sensor -> NoiseModel.
+    free : ndarray of bool, shape (n_params,)
+        Parameters that were estimated.
+
+    """
+    found, feigned = np.zeros(len(values), bool), {sensor: _feigned(system, sensor, values, noises[sensor]) for sensor in SENSORS}
+    for effect in system.model.effects:
+        part = system.model.slices[effect.key]
+        if effect.role is Role.OFFSET or not np.isfinite(_limit(effect)):
+            continue
+        size = np.abs(values[part] - system.prior.mean[part])
+        sensors = (effect.sensor,) if effect.sensor in SENSORS else effect.acts_on
+        strange = free[part] & (size > _limit(effect)) & (size < sd[part] * max(feigned[sensor] for sensor in sensors))
+        found[part] = strange if effect.role is Role.LINEAR else free[part] & strange.any()
+    return found
+
+
+def _limit(effect: Effect) -> float:
+    return FAR * float(np.max(effect.prior_sds())) if effect.role is Role.LINEAR else effect.largest
+
+
+def _feigned(system, sensor, values, noise):
+    """Return the largest shift, in sds of noise, of a parameter of the worst axis by all excess misfit of moving windows."""
+    rested = any(row.kind == 'static' for row in system.accumulator.rows)
+    rest = REST_NOISE_MARGIN * np.maximum(noise.low_variance, noise.white_variance) if rested else 0.0
+    total = np.zeros(3)
+    for kind, factor in system.within[sensor].items():
+        squares = (system.misfit(sensor, factor, values)**2).sum(axis=0)
+        weight = noise.low_variance * (noise.moving[kind].slow if kind in noise.moving else 1.0)
+        total += np.maximum(squares - system.dof_within[kind] * rest, 0.0) / weight
+    return float(np.sqrt(total.max()))
+
 
 HELD_SHARE = 0.5
 """A parameter whose standard deviation exceeds this share of its prior's is fixed at the prior."""

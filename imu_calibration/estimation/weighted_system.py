@@ -12,7 +12,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, WindowBlock
 from imu_calibration.estimation.noise_model import NoiseModel, sessions_of
 from imu_calibration.estimation.prior import Prior
-from imu_calibration.estimation.triangular import triangular
+from imu_calibration.estimation.scaled_solve import triangular
 from imu_calibration.estimation.whitening import Whitening
 
 LOOSE = 1e3

@@ -24,25 +24,22 @@ from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.nodes.calibration_guide import CalibrationGuide
-from imu_calibration.nodes.calibration_status import statuses_of
+from imu_calibration.nodes.calibration_status import CalibrationGuide, markers_of, statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
-from imu_calibration.nodes.coverage_markers import markers_of
+from imu_calibration.nodes.diagnosis_thread import Listeners, give_arrays_own_pages
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
-from imu_calibration.nodes.heap import give_arrays_own_pages
 from imu_calibration.nodes.inputs import BatchInput, latched_qos, output_qos, watch_inputs
 from imu_calibration.nodes.lifecycle import announce, run_node
 from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of, words_of
 from imu_calibration.nodes.session_files import SessionFiles, reference_of
-from imu_calibration.nodes.worker_requests import Listeners
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.provenance import provenance_with
 from imu_calibration.use_cases.resources import config_file
-from msg_adapters.encode import encode_imu, rows
 from msg_adapters.live import LiveGatherer
+from msg_adapters.write import encode_imu, rows
 
 INPUT_DEPTH = 5000
 """Messages that may wait: 2.5 s at 2 kHz, while numpy holds the interpreter."""

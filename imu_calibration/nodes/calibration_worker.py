@@ -17,10 +17,9 @@ from imu_calibration.calibration.session import LiveByHandSettings, LiveSession,
 from imu_calibration.core.errors import ImuCalibrationError, NotObservableError, shortened
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.trust import missing
-from imu_calibration.nodes.calibration_state import WorkerState
-from imu_calibration.nodes.diagnosis_thread import DiagnosisThread
+from imu_calibration.nodes.calibration_status import WorkerState
+from imu_calibration.nodes.diagnosis_thread import DiagnosisThread, Listeners, Request
 from imu_calibration.nodes.session_files import SessionFiles
-from imu_calibration.nodes.worker_requests import Listeners, Request
 from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.preprocessing.window import WindowSettings
 from msg_adapters.live import LiveGatherer

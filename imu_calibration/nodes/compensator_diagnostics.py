@@ -10,7 +10,7 @@ from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, MOVED, UNIT, WAITING
 from imu_calibration.core.units import HOTTEST_C
 from imu_calibration.document import trust
-from imu_calibration.estimation.status import LACKING
+from imu_calibration.estimation.solution import LACKING
 from imu_calibration.nodes.adoption import Adopted
 from imu_calibration.nodes.complaints import REMINDER
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status

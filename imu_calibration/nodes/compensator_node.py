@@ -22,15 +22,14 @@ from imu_calibration.core.documents import version_of
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, InputError, shortened
 from imu_calibration.document import files
 from imu_calibration.nodes import relay_loop
-from imu_calibration.nodes.adoption import Adopted, Awaited, adopt, again, has_moved
+from imu_calibration.nodes.adoption import Adopted, Awaited, CompensatorSettings, adopt, again, has_moved
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
-from imu_calibration.nodes.compensator_settings import CompensatorSettings
 from imu_calibration.nodes.complaints import ERROR, Complaints
 from imu_calibration.nodes.inputs import MatchedInput, latched_qos, output_qos, sent_ns, watch_inputs
 from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.parameters import HINTS, declare_parameters
-from imu_calibration.nodes.static_frames import StaticFrames
+from imu_calibration.nodes.robot_stand import StaticFrames
 
 LOOK_FOR_FILE = 1.0
 """Seconds between two attempts to find a calibration file that is waited for."""

@@ -1,13 +1,64 @@
-"""The thread of the diagnosis of model errors: a diagnosis is slow, and must delay neither the topics nor the solutions."""
+"""Requests to worker threads, the thread of the diagnosis, and return of unused memory."""
 
+import ctypes
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 from imu_calibration.calibration.diagnosis.live_diagnosis import FAILED, OFF, Answer, DiagnosisQuestion, DiagnosisState
 from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.session import SolvePacer
-from imu_calibration.nodes.heap import return_freed_memory
+
+THRESHOLD = 256 * 1024
+"""Bytes from which an array has separate pages, which are returned when it is freed; glibc raises its threshold to 32 MB, so that arrays
+remain in a fragmented heap: 265 MB instead of 128 MB after a diagnosis."""
+_M_MMAP_THRESHOLD = -3
+
+
+def _libc() -> Any:
+    """Return the C library where it has these functions (glibc), or None."""
+    library = ctypes.CDLL(None)
+    return library if hasattr(library, 'mallopt') and hasattr(library, 'malloc_trim') else None
+
+
+def give_arrays_own_pages() -> None:
+    """Fix the size from which arrays have pages of their own."""
+    if (libc := _libc()) is not None:
+        libc.mallopt(_M_MMAP_THRESHOLD, THRESHOLD)
+
+
+def return_freed_memory() -> None:
+    """Return the free pages of the heap to the system."""
+    if (libc := _libc()) is not None:
+        libc.malloc_trim(0)
+
+
+@dataclass(frozen=True)
+class Listeners:
+    """Receivers of the worker's results."""
+
+    calibration: Callable[[str], None]
+    """Called with the text of each new calibration document."""
+    residuals: Callable[[Any], None]
+    """Called with ImuSamples."""
+    coverage: Callable[[Any], None] = lambda coverage: None
+    """Called with each new Coverage."""
+
+
+class Request:
+    """A request to the worker."""
+
+    def __init__(self, action: Callable[[], tuple[bool, str]]):
+        self.action, self.done = action, threading.Event()
+        self.success, self.message = False, ''
+
+    def answer(self, success: bool, message: str) -> None:
+        """Set the result."""
+        self.success, self.message = success, message
+        self.done.set()
+
 
 SHARE = 0.2
 """Largest share of the time for diagnoses."""

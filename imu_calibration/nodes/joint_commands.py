@@ -18,7 +18,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from imu_calibration.nodes.inputs import node_of, output_qos
 from imu_calibration.nodes.lifecycle import guarded
-from msg_adapters.joint_trajectory import encode_trajectory
+from msg_adapters.joint_state import encode_trajectory
 
 COMMANDS = ('topic', 'action', 'auto')
 """How trajectories are sent; 'auto': by the action where control_msgs is installed and a server is there."""

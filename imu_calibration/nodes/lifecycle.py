@@ -19,8 +19,7 @@ from rclpy.utilities import remove_ros_args
 
 from imu_calibration.core.errors import ImuCalibrationError, shortened
 from imu_calibration.core.settings import describe
-from imu_calibration.nodes.parameter_files import meaning, settings_of, value_text
-from imu_calibration.nodes.parameters import unknown_parameters
+from imu_calibration.nodes.parameters import meaning, settings_of, unknown_parameters, value_text
 
 WIDTH = 118
 

@@ -8,7 +8,7 @@ from imu_calibration.compensation.health import StopWatch
 from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import late_ns
 from msg_adapters.imu_stream import ImuStream
-from msg_adapters.stamps import MessageError
+from msg_adapters.layout import MessageError
 
 MANY = 30
 """Largest number of reasons with separate counts: it bounds the memory."""

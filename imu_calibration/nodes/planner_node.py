@@ -38,8 +38,8 @@ from imu_calibration.kinematics.motion_limits import (
     missing_ranges,
     range_warnings,
 )
+from imu_calibration.nodes.calibration_status import driven_markers
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
-from imu_calibration.nodes.coverage_markers import driven_markers
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
 from imu_calibration.nodes.inputs import BatchInput, MatchedInput, latched_qos, watch_inputs
 from imu_calibration.nodes.joint_commands import OtherDrivers, make_command
@@ -57,7 +57,7 @@ from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import joint_row
-from msg_adapters.stamps import UnusableMessage
+from msg_adapters.layout import UnusableMessage
 
 
 @dataclass(frozen=True)

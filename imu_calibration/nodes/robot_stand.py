@@ -1,4 +1,4 @@
-"""An arm in place of a table for a node: its description from a file or robot_description, the IMU's link, the attitude of its root."""
+"""The table or robot description of a node, and static frames."""
 
 import time
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
@@ -16,11 +16,62 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.kinematics.table import Table
-from imu_calibration.kinematics.urdf import root_of, table_from_urdf
+from imu_calibration.kinematics.urdf import StaticTransforms, root_of, table_from_urdf
 from imu_calibration.nodes.complaints import WARNING, say
 from imu_calibration.nodes.inputs import latched_qos
-from imu_calibration.nodes.static_frames import StaticFrames
-from msg_adapters.stamps import clean_name
+from msg_adapters.layout import clean_name
+
+TF_STATIC = '/tf_static'
+DEPTH = 100
+"""Publishers of static transforms whose last message is wanted."""
+
+
+class StaticFrames:
+    """
+    The static transforms that are published; listens from the first question on.
+
+    Parameters
+    ----------
+    node : Node
+    changed : callable
+        Called after the reception of transforms.
+
+    """
+
+    def __init__(self, node: Node, changed: Callable[[], None]):
+        self._node, self._changed, self._subscription = node, changed, None
+        self.transforms, self.n_unusable = StaticTransforms(), 0
+
+    def pose(self, target: str, source: str) -> Any:
+        """Return the pose of a frame in another one (see `StaticTransforms.pose`), None while it is not known."""
+        self._listen()
+        return self.transforms.pose(target, source)
+
+    def waits_for(self, target: str, source: str) -> str:
+        """Return a readable description of the awaited transform."""
+        return f"the transform from '{target}' to '{source}' on {TF_STATIC}: {self.transforms.why_not(target, source)}" + \
+            (f'; {self.n_unusable} received transforms are unusable (not finite)' if self.n_unusable else '')
+
+    def take(self, message: Any) -> None:
+        """Process a tf2_msgs/TFMessage."""
+        for stamped in message.transforms:
+            place, turn = stamped.transform.translation, stamped.transform.rotation
+            usable = self.transforms.add(*(clean_name(name).lstrip('/') for name in (stamped.header.frame_id, stamped.child_frame_id)),
+                                         xyz=(place.x, place.y, place.z),
+                                         quaternion=(turn.x, turn.y, turn.z, turn.w))
+            self.n_unusable += not usable
+        self._changed()
+
+    def _listen(self):
+        if self._subscription is None:
+            try:
+                from tf2_msgs.msg import TFMessage
+            except ImportError as error:
+                raise InputError(f'{TF_STATIC} needs the messages of the package tf2_msgs, which is not installed; '
+                                 'install ros-jazzy-tf2-msgs, or give target_xyz and target_rpy', code='package_missing') from error
+            qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self._subscription = self._node.create_subscription(TFMessage, TF_STATIC, self.take, qos)
+
 
 TOPIC = 'topic'
 """Value of `urdf_file` that selects the topic robot_description."""

@@ -26,7 +26,7 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import BY_DEFINITION
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
-from imu_calibration.estimation.status import DETERMINED
+from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.kinematics.motion_limits import limits_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
@@ -41,8 +41,8 @@ from imu_calibration.simulation.sensor_noise import CAUSES, GRADES, hidden_cause
 from imu_calibration.simulation.session import SimulationOptions, random_values
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 from imu_calibration.use_cases.resources import config_file
-from msg_adapters.encode import encode_imu, encode_joints, encode_temperature, rows
-from msg_adapters.joint_trajectory import trajectory_from_message
+from msg_adapters.joint_state import trajectory_from_message
+from msg_adapters.write import encode_imu, encode_joints, encode_temperature, rows
 
 STRETCH = 0.1
 """Seconds of simulated time that are computed together, times the time factor; as playback makes some such stretches ahead, a

@@ -13,7 +13,7 @@ from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.settings import setting
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.estimation.status import HELD, tolerances_of
+from imu_calibration.estimation.solution import HELD, tolerances_of
 from imu_calibration.kinematics.motion_limits import MotionLimits, limits_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.belief import exact_information

@@ -11,7 +11,7 @@ import numpy as np
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel, ReferenceNoise
-from imu_calibration.estimation.status import tolerances_of
+from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints, limits_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.belief import Belief

@@ -6,16 +6,18 @@ from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.core.units import error_text
 from imu_calibration.document.trust import usage
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.status import DETERMINED
-from imu_calibration.report.budget_section import budget_section
-from imu_calibration.report.geometry import derived_section, lever_section
+from imu_calibration.estimation.solution import DETERMINED
+from imu_calibration.report.calibration_sections import (
+    budget_section,
+    observability_section,
+    origin_section,
+    proof_section,
+    reading_tables,
+    recording_facts,
+)
+from imu_calibration.report.figures import derived_section, lever_section
 from imu_calibration.report.navigation_section import navigation_section
-from imu_calibration.report.observability_section import observability_section
-from imu_calibration.report.origin import origin_section, recording_facts
-from imu_calibration.report.page import render
-from imu_calibration.report.parameters import parameter_groups
-from imu_calibration.report.proof_section import proof_section
-from imu_calibration.report.readings import reading_tables
+from imu_calibration.report.page import parameter_groups, render
 from imu_calibration.report.residuals import draw_windows, residual_section
 
 

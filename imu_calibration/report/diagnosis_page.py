@@ -10,13 +10,9 @@ from imu_calibration.core.units import for_people
 from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.document.verdict import judge
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
-from imu_calibration.report.drawn import Drawn
-from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, draw
-from imu_calibration.report.numbers import in_unit, people, text
+from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, Drawn, draw, draw_tones
 from imu_calibration.report.overlay import overlay_section, variables
-from imu_calibration.report.page import render
-from imu_calibration.report.parameters import parameter_groups
-from imu_calibration.report.spectrum_figure import draw_tones
+from imu_calibration.report.page import in_unit, parameter_groups, people, render, text
 
 BINS = 16
 FEW = 200

@@ -1,4 +1,4 @@
-"""Style of all figures and their output as SVG inside the page: no screen, no dates, the same input gives the same bytes."""
+"""Figures that are drawn when they are shown: curves, spectra, the geometry of the sensors."""
 
 import io
 import math
@@ -6,7 +6,47 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from imu_calibration.report.drawn import Drawn
+import numpy as np
+
+from imu_calibration.calibration.installation_angles import PAIRS, derive, in_paper_units
+from imu_calibration.calibration.result import CalibrationResult
+from imu_calibration.compensation.compensate import arms_of
+from imu_calibration.core.units import DEG, decimals
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.report.page import fixed, pair
+from imu_calibration.selection.spectrum import CLEAR
+from imu_calibration.selection.unexplained import Unexplained
+
+
+class Drawn(str):
+    """SVG of a matplotlib figure; templates do not escape it."""
+
+    figure: Any
+    """The matplotlib figure."""
+
+    def __new__(cls, svg: str, figure: Any) -> 'Drawn':
+        """Return the SVG with its figure."""
+        made = super().__new__(cls, svg)
+        made.figure = figure
+        return made
+
+    def __html__(self) -> str:
+        return str(self)
+
+    @property
+    def pdf(self) -> bytes:
+        """The figure as PDF; the same input gives the same bytes."""
+        from matplotlib.backends.backend_pdf import FigureCanvasPdf
+        whole = io.BytesIO()
+        FigureCanvasPdf(self.figure).print_pdf(whole, metadata={'CreationDate': None})
+        return whole.getvalue()
+
+    @property
+    def data(self) -> list[dict[str, Any]]:
+        """For each axes its title and labels, and 'lines': list of (label, x (n,), y (n,)) as arrays in the units of the labels."""
+        return [{'title': axes.get_title(loc='left'), 'x': axes.get_xlabel(), 'y': axes.get_ylabel(),
+                 'lines': [(line.get_label(), *line.get_data()) for line in axes.get_lines()]} for axes in self.figure.axes]
+
 
 INK, GREY, FAINT, GRID = '#1b2430', '#5c6877', '#98a2b0', '#e3e8ee'
 BEFORE, AFTER = '#d55e00', '#0072b2'
@@ -100,3 +140,88 @@ def axis_legend(axes: Any, where: str = 'upper right', **more: Any) -> None:
     from matplotlib.lines import Line2D
     handles = [Line2D([], [], color=colour, marker=MARKER[name], markersize=4, lw=0, label=name) for name, colour in AXIS.items()]
     axes.legend(handles=handles, loc=where, ncols=3, columnspacing=1.0, handletextpad=0.2, **more)
+
+
+def draw_tones(sensor: str, rest: Unexplained) -> str:
+    """Return the spectra with significant tones, as SVG; empty if there are none."""
+    if not rest.tones:
+        return ''
+    label = f'Spectrum of the unexplained residual of the {sensor}'
+    return draw(f'tones-{sensor}', (8.6, 0.6 + 2.1 * len(rest.tones)), _Spectra(rest.tones), label=label)
+
+
+class _Spectra:
+    """One panel for each tone: the power of its axis over that around it."""
+
+    def __init__(self, tones):
+        self.tones = tones
+
+    def __call__(self, figure):
+        for axes, tone in zip(np.atleast_1d(figure.subplots(len(self.tones), 1)), self.tones):
+            axes.plot(tone.frequencies, tone.power, color=AFTER, lw=0.9)
+            axes.axhline(CLEAR, color=GREY, lw=0.6)
+            axes.axvline(tone.frequency, color=INK, lw=0.8, ls=':')
+            axes.set_yscale('log')
+            axes.set_ylabel(f'{tone.sensor} {tone.axis}: power / around')
+            axes.set_xlabel('frequency, Hz' if tone.joint is None else f'cycles per turn of {tone.joint}')
+
+
+PLANES = ((0, 1), (0, 2), (1, 2))
+
+
+def derived_section(result: CalibrationResult) -> list[dict[str, Any]]:
+    """Return scale factors, angles and biases of both sensors, as rows of text."""
+    return [_derived(derive(result.calibration, sensor), result.options.nominal) for sensor in SENSORS]
+
+
+def _derived(found, nominal):
+    angles = [[' ± '.join(pair(v / DEG, s / DEG)) for v, s in zip(*rows)] for rows in zip(found.angles, found.angles_sd)]
+    between = [('xyz'[i] + '–' + 'xyz'[j], ' ± '.join(pair(v / DEG, s / DEG)))
+               for (i, j), v, s in zip(PAIRS, found.between, found.between_sd)]
+    lines = [{'what': what, 'unit': unit, 'values': [' ± '.join(pair(v, s)) for v, s in zip(values, sds)]}
+             for what, unit, values, sds in in_paper_units(found, nominal)]
+    ppm = [fixed((v - 1) * 1e6, decimals(max(s, 1e-12) * 1e6)) for v, s in zip(found.scale, found.scale_sd)]
+    return {'sensor': found.sensor, 'lines': lines, 'ppm': ppm, 'angles': angles, 'between': between}
+
+
+def lever_section(result: CalibrationResult) -> dict[str, Any] | None:
+    """Return the drawing of the lever arms, or None when the model has none."""
+    if result.calibration.of('accelerometer', Role.ARMS) is None:
+        return None
+    gauge = result.calibration.gauge.get('origin')
+    origin = 'the mean of the three sensitive points' if gauge == 'mean_of_sensitive_points' else 'the reference point of the mount'
+    return {'figure': draw('lever-arms', (8.6, 3.15), _Arms(result.calibration),
+                           label='Sensitive points of the three accelerometers in three views'), 'origin': origin}
+
+
+class _Arms:
+    """Three views: sensitive points with ellipses of two sd."""
+
+    def __init__(self, calibration):
+        self.arms = arms_of(calibration) * 1e3
+        part = calibration.model.part('accelerometer', Role.ARMS)
+        self.cov = calibration.covariance[part, part] * 1e6
+
+    def __call__(self, figure):
+        limit = 1.25 * max(float(np.max(np.abs(self.arms))), 3 * float(np.sqrt(np.diag(self.cov).min())), 1e-3)
+        for axes, (across, up) in zip(figure.subplots(1, 3), PLANES):
+            axes.axhline(0, color=GREY, lw=0.6)
+            axes.axvline(0, color=GREY, lw=0.6)
+            for element, colour in enumerate(AXIS.values()):
+                self._point(axes, element, across, up, colour)
+            axes.plot(0, 0, '+', color=INK, markersize=9, mew=1.3)
+            axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect='equal', xlabel=f'{"xyz"[across]}, mm', ylabel=f'{"xyz"[up]}, mm')
+            axes.locator_params(nbins=5)
+
+    def _point(self, axes, element, across, up, colour):
+        x, y = self.arms[element, across], self.arms[element, up]
+        axes.annotate('', (x, y), (0, 0), arrowprops={'arrowstyle': '-', 'color': colour, 'lw': 1.1, 'alpha': 0.55})
+        axes.plot(x, y, 'o', color=colour, markersize=5)
+        index = [3 * element + across, 3 * element + up]
+        values, vectors = np.linalg.eigh(self.cov[np.ix_(index, index)])
+        angle = np.linspace(0, 2 * np.pi, 61)
+        ring = 2 * np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
+        axes.plot(*(np.array([[x], [y]]) + vectors @ ring), color=colour, lw=0.9)
+        away = 11 * np.array([x, y]) / max(np.hypot(x, y), 1e-9)
+        axes.annotate('xyz'[element], (x, y), away, textcoords='offset points', color=colour, fontsize=10, fontweight='bold', ha='center',
+                      va='center')

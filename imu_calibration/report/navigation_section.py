@@ -9,12 +9,12 @@ from imu_calibration.calibration.result import CalibrationResult, WindowErrors
 from imu_calibration.compensation.compensate import compensate
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.effects.base import Role
-from imu_calibration.estimation.standard_motions import _attitudes
+from imu_calibration.estimation.observability import _attitudes
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.strapdown import strapdown
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, draw, log_axis
-from imu_calibration.report.numbers import text
+from imu_calibration.report.page import text
 
 SECONDS = 50.0
 """Length of the runs at rest, the papers' own."""

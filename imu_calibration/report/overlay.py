@@ -9,7 +9,7 @@ import numpy as np
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.core.units import STANDARD_GRAVITY, for_people
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
-from imu_calibration.report.numbers import text
+from imu_calibration.report.page import text
 
 MOST_POINTS = 1200
 """Points of a chart against a variable."""

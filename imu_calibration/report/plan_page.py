@@ -1,20 +1,140 @@
-"""The report of a plan: the predicted result first, then the motion and its derivation."""
+"""The page of a plan, on a table or by hand, with its figures."""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from imu_calibration.calibration.hand_step import HandStep, direction_words
 from imu_calibration.core.units import for_people
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.kinematics.rotations import align
 from imu_calibration.planning.hand_plan import HandPlan
 from imu_calibration.planning.planner import Plan
 from imu_calibration.planning.repertoire import MotionKind
-from imu_calibration.report.hand_plan_figure import draw_steps
-from imu_calibration.report.numbers import text
-from imu_calibration.report.page import render
-from imu_calibration.report.plan_figures import draw_motion, draw_progress, draw_steps_progress
+from imu_calibration.report.figures import AXIS, FAINT, GREY, INK, Drawn, draw, log_axis
+from imu_calibration.report.page import render, text
+
+SIZE = np.array([1.0, 0.7, 0.3])
+"""Half edges of the box along x, y, z: all different, so that attitudes are distinguishable."""
+VIEW = np.array([[-np.sqrt(0.5), np.sqrt(0.5), 0.0], [-0.35, -0.35, 0.87]])
+"""From the level frame to the picture: seen from above one's shoulder."""
+COLUMNS, MOST = 6, 36
+
+
+def draw_steps(steps: Sequence[HandStep]) -> str:
+    """Return the steps as SVG, numbered in the order of time."""
+    shown = list(steps)[:MOST]
+    rows = max(1, -(-len(shown) // COLUMNS))
+    return draw('hand-steps', (8.6, 1.75 * rows), lambda figure: _paint(figure, shown, rows), label='How to hold and to turn the IMU')
+
+
+def _paint(figure, steps, rows):
+    axes = np.atleast_1d(figure.subplots(rows, COLUMNS)).ravel()
+    for place, axis in enumerate(axes):
+        axis.set_axis_off()
+        if place < len(steps):
+            _box(axis, steps[place].up)
+            axis.set_title(f'{place + 1}: {direction_words(steps[place].up)} up', fontsize=8, color=INK)
+            axis.set_aspect('equal')
+            axis.set_xlim(-1.7, 1.7)
+            axis.set_ylim(-1.5, 1.6)
+
+
+def _box(axis, up):
+    mat_ns = align(np.asarray(up, float))
+    toward = np.cross(VIEW[0], VIEW[1])
+    for k, sign in itertools.product(range(3), (1.0, -1.0)):
+        normal = sign * np.eye(3)[k]
+        if (mat_ns @ normal) @ toward > 0:
+            others = [i for i in range(3) if i != k]
+            corners = [normal * SIZE[k] + a * SIZE[others[0]] * np.eye(3)[others[0]] + b * SIZE[others[1]] * np.eye(3)[others[1]]
+                       for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+            axis.fill(*(VIEW @ mat_ns @ np.array(corners).T), facecolor='#f4f6f9', edgecolor=FAINT, lw=1.0)
+    for k, (name, colour) in enumerate(AXIS.items()):
+        tip = VIEW @ mat_ns @ (np.eye(3)[k] * (SIZE[k] + 0.55))
+        axis.annotate('', tip, (0, 0), arrowprops={'arrowstyle': '->', 'color': colour, 'lw': 1.4})
+        axis.text(*(1.12 * tip), name, color=colour, fontsize=8, ha='center', va='center')
+    axis.annotate('', (-1.55, 1.2), (-1.55, 0.4), arrowprops={'arrowstyle': '->', 'color': GREY, 'lw': 1.0})
+    axis.text(-1.55, 0.2, 'up', color=GREY, fontsize=7, ha='center', va='center')
+
+
+KIND = {MotionKind.POSE: '#2b8a57', MotionKind.RETURN: '#7fbf9a', MotionKind.SPIN: '#1f66a8', MotionKind.SWING: '#d08a12',
+        MotionKind.TOGETHER: '#8a4fa8', MotionKind.MOVE: '#98a2b0'}
+"""Colours of the motions."""
+COLOURS = tuple(AXIS.values()) + ('#8a4fa8', '#d08a12', '#555f6b', '#c0561b', '#1b2430')
+
+
+def draw_motion(plan: Plan) -> str:
+    """Return the joints against time as SVG, the kinds of motion as a band above."""
+    return draw('plan-motion', (8.6, 3.6), lambda figure: _motion(figure, plan), label='Positions of the joints against time')
+
+
+def draw_progress(plan: Plan) -> Drawn:
+    """Return the standard deviations in tolerances against time as SVG, one line for each parameter."""
+    return draw('plan-progress', (8.6, 4.2), lambda figure: _progress(figure, plan), label='Predicted standard deviations against time')
+
+
+def _motion(figure, plan):
+    axes, points = figure.subplots(), plan.points
+    if not len(points):
+        return
+    turns = plan.motions[0].limits.turns
+    time = np.concatenate([[0.0], points.time])
+    position = np.concatenate([plan.start[None], points.position])
+    for k, name in enumerate(points.joint_names):
+        values = np.degrees(position[:, k]) if turns[k] else 1000 * position[:, k]
+        wrapped = (values + 180.0) % 360.0 - 180.0 if turns[k] else values
+        wrapped = np.where(np.abs(np.diff(wrapped, prepend=wrapped[0])) > 180.0, np.nan, wrapped)
+        axes.plot(time, wrapped, color=COLOURS[k % len(COLOURS)], lw=1.2, label=f'{name}, {"deg" if turns[k] else "mm"}')
+    top, bottom = axes.get_ylim()[1], axes.get_ylim()[0]
+    begins, shown = np.concatenate([[0.0], plan.ends[:-1]]), set()
+    for motion, begin, end in zip(plan.motions, begins, plan.ends, strict=True):
+        axes.fill_between([begin, end], top, top + 0.06 * (top - bottom), color=KIND[motion.kind], lw=0,
+                          label=None if motion.kind in shown else str(motion.kind))
+        shown.add(motion.kind)
+    axes.set_xlabel('time, s')
+    axes.set_ylabel('position')
+    axes.legend(ncols=4, loc='upper center', bbox_to_anchor=(0.5, -0.16))
+
+
+def draw_steps_progress(plan: HandPlan) -> str:
+    """Return the same for the steps of a plan by hand."""
+    def paint(figure):
+        _fall(figure.subplots(), np.arange(len(plan.history)), plan.history, plan.param_names, label='poses and turns')
+    return draw('plan-progress', (8.6, 4.2), paint, label='Predicted standard deviations against steps')
+
+
+def _progress(figure, plan):
+    axes = figure.subplots()
+    names = [name for name, wanted in zip(plan.model.param_names, plan.wanted, strict=True) if wanted]
+    _fall(axes, np.concatenate([[0.0], plan.ends]), plan.history, names, label='time, s')
+    if 0 < plan.lower_bound_seconds < np.inf and not plan.missing:
+        axes.axvline(plan.lower_bound_seconds, color=FAINT, lw=1.2)
+        axes.annotate('least time', (plan.lower_bound_seconds, axes.get_ylim()[1]), (4, -10), textcoords='offset points', color=GREY,
+                      fontsize=8)
+
+
+def _fall(axes, time, history, names, *, label):
+    """Draw a line for each parameter, the worst of all, and the tolerance."""
+    shown = set()
+    for name, values in zip(names, history.T, strict=True):
+        sensor = name.split('.')[0]
+        colour = AXIS['x'] if sensor == SENSORS[0] else AXIS['z']
+        axes.plot(time, np.maximum(values, 1e-3), color=colour, lw=0.9, alpha=0.6, label=None if sensor in shown else sensor)
+        shown.add(sensor)
+    axes.plot(time, history.max(axis=1), color=GREY, lw=2.2, label='worst of all')
+    axes.axhline(1.0, color=FAINT, ls='--', lw=1.2)
+    axes.annotate('tolerance', (time[-1], 1.0), (-4, 4), textcoords='offset points', ha='right', color=GREY, fontsize=8)
+    log_axis(axes.yaxis)
+    axes.set_xlabel(label)
+    axes.set_ylabel('sd / tolerance')
+    axes.legend(loc='upper right')
+
 
 SAYS = {MotionKind.POSE: 'rest', MotionKind.RETURN: 'return', MotionKind.SPIN: 'spin', MotionKind.SWING: 'swing',
         MotionKind.TOGETHER: 'joint turn', MotionKind.MOVE: 'move'}

@@ -8,9 +8,8 @@ from imu_calibration.calibration.result import CalibrationResult, WindowErrors
 from imu_calibration.core.units import for_people
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS, UNIT
-from imu_calibration.report.drawn import Drawn
-from imu_calibration.report.figures import AXIS, GREY, MARKER, axis_legend, draw
-from imu_calibration.report.numbers import in_unit, text
+from imu_calibration.report.figures import AXIS, GREY, MARKER, Drawn, axis_legend, draw
+from imu_calibration.report.page import in_unit, text
 
 LAG_SECONDS = 2.0
 """Longest lag that is drawn."""

@@ -14,14 +14,18 @@ from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.evidence import WindowEvidence, agree, folds_of
-from imu_calibration.selection.noise_beside_effects import first_noise, noise_beside_effects
-from imu_calibration.selection.normal_matrices import normal_matrix
-from imu_calibration.selection.parameter_space import ParameterSpace, counted_from_values, parameter_space, questions, smooth_parameters
+from imu_calibration.selection.noise_beside_effects import first_noise, in_trusted_band, noise_beside_effects
+from imu_calibration.selection.parameter_space import (
+    ParameterSpace,
+    counted_from_values,
+    normal_matrix,
+    parameter_space,
+    questions,
+    smooth_parameters,
+)
 from imu_calibration.selection.questions import Question, extended_model, time_constants
-from imu_calibration.selection.reduced_recording import ReducedRecording, mean_arms, reduce_recording
+from imu_calibration.selection.reduced_recording import ReducedRecording, make_bank, mean_arms, reduce_recording
 from imu_calibration.selection.search import FAMILY_WISE, Search
-from imu_calibration.selection.time_constant_bank import make_bank
-from imu_calibration.selection.trusted_band import in_trusted_band
 
 FASTEST = 2 * np.pi * 3.0
 """Assumed angular frequency of motions in the curvature of a delay, rad/s."""

@@ -11,9 +11,8 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, solve_normal, solve_scaled
 from imu_calibration.estimation.solution import SURE
-from imu_calibration.selection.normal_matrices import white_means, within_of_axis
-from imu_calibration.selection.parameter_space import ParameterSpace
-from imu_calibration.selection.recent import Recent
+from imu_calibration.selection.parameter_space import ParameterSpace, white_means, within_of_axis
+from imu_calibration.selection.reduced_recording import Recent
 
 LEAST_WINDOWS = 8
 """Least number of windows for held-out folds."""

@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.noise_beside_effects import plausible_processes
-from imu_calibration.selection.normal_matrices import scatter_of_each
+from imu_calibration.selection.parameter_space import scatter_of_each
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Search
 

@@ -11,7 +11,7 @@ from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import LEAST_WINDOWS
 from imu_calibration.selection.explained_share import LEAST_SHARE, SIGNIFICANT_REST, ExplainedWindows
-from imu_calibration.selection.normal_matrices import matrix_of_each
+from imu_calibration.selection.parameter_space import matrix_of_each
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_blocks import residuals
 

@@ -7,11 +7,10 @@ import numpy as np
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.effects.base import AXES, SENSORS, SHORT, Effect
 from imu_calibration.effects.catalogue import term
-from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
+from imu_calibration.estimation.observability import MOTIONS, TABLE_MOTIONS
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import LEAST_SHARE_SMOOTH
-from imu_calibration.selection.formulas import FormulaChoice, FormulaSearch
-from imu_calibration.selection.grammar import Formula, grammar
+from imu_calibration.selection.formulas import Formula, FormulaChoice, FormulaSearch, grammar
 from imu_calibration.selection.residual_blocks import RestBlocks
 from imu_calibration.selection.residual_fit import BlockFit, BlockFits, share_interval, share_removed
 

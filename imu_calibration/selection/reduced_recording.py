@@ -1,22 +1,103 @@
-"""A recording reduced with the columns of all candidate effects: sufficient for candidates, folds and resamples."""
+"""A recording reduced to factors: columns at a bank of time constants, windows of the recent past."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import References, all_arms, coefficients, columns
+from imu_calibration.effects.base import SENSORS, Effect
+from imu_calibration.effects.forward_equations import References, all_arms, coefficients, columns, effect_slopes
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, restricted_window, selected_columns
 from imu_calibration.estimation.noise_model import sessions_of
-from imu_calibration.estimation.triangular import PackedFactor, unpacked
+from imu_calibration.estimation.scaled_solve import PackedFactor, unpacked
 from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_windows
+from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, chunks
-from imu_calibration.selection.recent import Recent
-from imu_calibration.selection.time_constant_bank import BankEntry
+
+
+class Recent(dict):
+    """
+    The last results by key; beyond `most` the oldest is dropped and computed again on demand.
+
+    Parameters
+    ----------
+    most : int
+        Results kept at most.
+
+    """
+
+    def __init__(self, most: int):
+        super().__init__()
+        self._most = most
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        """Keep a result."""
+        super().__setitem__(key, value)
+        if len(self) > self._most:
+            del self[next(iter(self))]
+
+
+WIDE = 10.0
+"""
+Standard deviations of amplitudes in a bank, times the effect's own: neighbours share one curve with opposite signs, and where the prior
+constrained them the estimated noise changed; from a factor of six on it does not.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class BankEntry:
+    """One effect at one time constant."""
+
+    effect: Effect
+    """It."""
+    number: int
+    """Number of the time constant."""
+    point: dict
+    """Point of linearisation."""
+    used: tuple
+    """(ColumnGroup, columns that the amplitudes multiply), ..."""
+    slopes: np.ndarray
+    """d(coefficients) / d(amplitudes), shape (n_columns, 3, n_amplitudes)."""
+    label: str
+    """Effect name and number of the time constant."""
+
+    @property
+    def param_names(self) -> list[str]:
+        """Names of the amplitudes."""
+        return [f'{self.label}.{component}' for component in self.effect.amplitudes(self.effect.components)]
+
+    @property
+    def prior_sd(self) -> np.ndarray:
+        """Standard deviations of the amplitudes before any data."""
+        return WIDE * self.effect.amplitudes(self.effect.prior_sds())
+
+    def columns(self, ref: Reference) -> np.ndarray:
+        """Return the columns that the amplitudes multiply, shape (n, n_columns)."""
+        return np.concatenate([group.columns(ref, self.point)[:, rows] for group, rows in self.used], axis=1)
+
+
+def make_bank(effects: Sequence[Effect], constants: np.ndarray, model: SensorModel, *, values: np.ndarray) -> dict[str, list[BankEntry]]:
+    """Return sensor -> list of BankEntry for the `effects` that have a time constant, at `values` of a model for the rest of the sensor."""
+    bank = {sensor: [] for sensor in SENSORS}
+    for effect in effects:
+        if effect.time_constant:
+            bank[effect.sensor] += [_entry(effect, number, constant, model, values) for number, constant in enumerate(constants)]
+    return bank
+
+
+def _entry(effect, number, constant, model, values):
+    own = effect.at_time_constant(constant)
+    point = {**model.full_point(), effect.name: own}
+    slopes = effect_slopes(effect, {**model.values_of(effect.sensor, values), effect.name: own}, point)[1]
+    amplitudes = {name: effect.amplitudes(np.moveaxis(block, -1, 0)) for name, block in slopes.items()}
+    used = [(group, np.flatnonzero(np.any(amplitudes[group.name] != 0, axis=(0, 2)))) for group in effect.groups]
+    joined = np.concatenate([amplitudes[group.name][:, rows] for group, rows in used], axis=1)
+    return BankEntry(effect, number, point, tuple(used), np.moveaxis(joined, 0, -1), f'{effect.name}@{number}')
+
 
 PARTS = ('within', 'slow')
 """Triangular factors of a window: of all centred rows, and of the means of short pieces."""

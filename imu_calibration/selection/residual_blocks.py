@@ -9,7 +9,7 @@ from scipy.linalg import solve_triangular
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import References, columns
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_at_rest import LEAST_NOISE
+from imu_calibration.estimation.session_noise import LEAST_NOISE
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table

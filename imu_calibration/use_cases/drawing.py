@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from imu_calibration.document import files
-from imu_calibration.report.drawn import Drawn
+from imu_calibration.report.figures import Drawn
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ class IdentifiedNoise:
 
     def plot(self, sensor: str = 'accelerometer') -> Drawing:
         """Return the Allan deviations of one sensor with their model as a figure for a notebook."""
-        from imu_calibration.report.noise_curve import draw_curve
+        from imu_calibration.report.noise_page import draw_curve
         return Drawing(draw_curve(self.result, sensor))
 
     @cached_property

@@ -19,7 +19,7 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE, SensorModel, parse_effects
-from imu_calibration.estimation.status import tolerances_of
+from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.kinematics.motion_limits import NOT_CHECKED, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.campaign import make_separator
@@ -78,7 +78,7 @@ class Planned:
 
     def plot(self) -> Drawing:
         """Return the standard deviations against time, in tolerances, as a figure for a notebook."""
-        from imu_calibration.report.plan_figures import draw_progress
+        from imu_calibration.report.plan_page import draw_progress
         return Drawing(draw_progress(self.plan))
 
     def save(self, folder: str | PathLike, *, report: bool = True, bag: bool = True, storage: str = 'sqlite3') -> None:

@@ -19,7 +19,7 @@ from imu_calibration.document.decision import BY_DEFINITION
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
-from imu_calibration.estimation.status import DETERMINED
+from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES

@@ -14,7 +14,7 @@ from imu_calibration.document import files
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import root_of, table_from_urdf, up_of
 from imu_calibration.use_cases.recordings import Topics, existing
-from msg_adapters.description import description_in, frame_of, static_transforms
+from msg_adapters.bag import description_in, frame_of, static_transforms
 
 LIKELY_LINK = 'imu_link'
 """The IMU's link where no recording names its frame."""

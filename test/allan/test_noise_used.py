@@ -28,8 +28,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.kinematics.table import Table
-from imu_calibration.nodes.adoption import adopt
-from imu_calibration.nodes.compensator_settings import CompensatorSettings
+from imu_calibration.nodes.adoption import CompensatorSettings, adopt
 from imu_calibration.references.options import CalibrationOptions
 from msg_adapters.imu import FIELDS, parse_imu
 

@@ -10,7 +10,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.core.documents import to_text
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.estimation.pieces import Regime
+from imu_calibration.estimation.window_statistics import Regime
 from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.check import check

@@ -15,7 +15,7 @@ from imu_calibration.calibration.pose_scan import NOTHING
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.estimation.standard_motions import MOTIONS, motions_about
+from imu_calibration.estimation.observability import MOTIONS, motions_about
 from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.calibrate import calibrate
@@ -175,7 +175,7 @@ def picture(coverage):
     """The markers by name."""
     from builtin_interfaces.msg import Time
 
-    from imu_calibration.nodes.coverage_markers import markers_of
+    from imu_calibration.nodes.calibration_status import markers_of
     made = {}
     for marker in markers_of(coverage, Time(sec=3)).markers:
         made.setdefault(marker.ns, []).append(marker)

@@ -7,12 +7,11 @@ import pytest
 
 from imu_calibration.calibration.diagnosis import hand_diagnosis as by_hand
 from imu_calibration.calibration.diagnosis import table_diagnosis as on_a_table
-from imu_calibration.calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST, candidates_of, finding, sentence
-from imu_calibration.calibration.diagnosis.separating_motion import motions_of_one_joint
+from imu_calibration.calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST, candidates_of, finding, motions_of_one_joint, sentence
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.observability import OTHER_MOUNT
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.standard_motions import OTHER_MOUNT
 from imu_calibration.selection import search as forward
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question

@@ -6,7 +6,7 @@ import pytest
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.decision import UNPROVEN, decide, reason_of
 from imu_calibration.effects.base import Role
-from imu_calibration.estimation.status import HELD
+from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.check import check

@@ -11,10 +11,10 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
-from imu_calibration.estimation.pieces import Regime, moving_pieces
 from imu_calibration.estimation.solver import solve
+from imu_calibration.estimation.window_statistics import Regime, moving_pieces
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable import held_out
+from imu_calibration.references.turntable.gathered import FOLDS, HeldOut
 from imu_calibration.use_cases.calibrate import calibrate
 
 from worlds.misfit_worlds import make_pair
@@ -76,7 +76,7 @@ def test_a_fold_is_left_out_as_if_it_had_not_been_recorded(clean):
     without = dealt.values_without(result.solution)
     rest = Accumulator()
     for k, block in enumerate(dealt.blocks):
-        if k % held_out.FOLDS != 2:
+        if k % FOLDS != 2:
             rest.merge(block.accumulator)
     assert not rest.blocks   # memory that nobody needs
     again = solve(rest, result.model, noise=result.solution.noise)
@@ -95,7 +95,7 @@ def test_every_window_is_dealt_to_one_block(clean):
 
 
 def test_memory_does_not_grow_with_the_session(clean):
-    twice = held_out.HeldOut()
+    twice = HeldOut()
     for _ in range(3):
         twice.merge(clean.result.gathered.held_out)
     sizes = [factor.shape for block in twice.blocks for factor in block.pieces.values()]

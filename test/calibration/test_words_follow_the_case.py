@@ -10,8 +10,8 @@ from imu_calibration.calibration.from_solution import motions_needed
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.comparison import compare
-from imu_calibration.estimation.pieces import Regime
-from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT, motions_about
+from imu_calibration.estimation.observability import MOTIONS, OTHER_MOUNT, motions_about
+from imu_calibration.estimation.window_statistics import Regime
 from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.compensate import compensate

@@ -16,7 +16,7 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.use_cases.recordings import Topics
 from imu_calibration.use_cases.simulate import simulate
 from imu_calibration.use_cases.stand import Arm, table_of
-from msg_adapters.description import DESCRIPTION_TOPIC, STATIC_TOPIC
+from msg_adapters.bag import DESCRIPTION_TOPIC, STATIC_TOPIC
 from msg_adapters.write import write_session
 
 from worlds.arms import SIX_AXES, joint, robot

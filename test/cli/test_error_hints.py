@@ -17,7 +17,7 @@ from imu_calibration.cli.parser import VERBS, hints_of, make_parser
 from imu_calibration.core.errors import KEYS, InputError, with_hint
 from imu_calibration.core.errors import VERBS as PROGRAMS
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.estimation.status import COMMON_SCALE
+from imu_calibration.estimation.solution import COMMON_SCALE
 from imu_calibration.nodes.parameters import HINTS
 from imu_calibration.preprocessing.joint_checks import check_force
 from msg_adapters.write import write_session

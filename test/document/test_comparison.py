@@ -13,7 +13,7 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.comparison import LEVEL, compare
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.status import DETERMINED, HELD
+from imu_calibration.estimation.solution import DETERMINED, HELD
 
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
 COUNT = len(MODEL.param_names)

@@ -11,9 +11,9 @@ from imu_calibration.core.units import STANDARD_GRAVITY as G
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.status import DETERMINED
+from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.papers import zhang2017 as zhang
-from imu_calibration.report.numbers import people
+from imu_calibration.report.page import people
 
 MODEL = SensorModel()
 DEG = np.pi / 180

@@ -15,7 +15,7 @@ from imu_calibration.document.calibration import Calibration, implausible
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text, from_mapping, to_mapping
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.status import DETERMINED, HELD, WEAK, Status
+from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK, Status
 
 ACCELEROMETER = ('accel_quadratic', 'accel_cubic', 'accel_cross_product', 'accel_scale_asymmetry', 'accel_size_effect', 'lever_arm', 'accel_thermal_bias',
                  'accel_thermal_scale', 'accel_bias_drift', 'accel_bandwidth')

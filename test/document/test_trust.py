@@ -15,7 +15,7 @@ from imu_calibration.document.calibration import HAND_AXES
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text, from_mapping, to_mapping
 from imu_calibration.document.decision import HARMS, HELPS, NO_PROOF, UNPROVEN, decide, most_cautious, reason_of
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.status import HELD
+from imu_calibration.estimation.solution import HELD
 from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration

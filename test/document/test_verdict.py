@@ -9,7 +9,7 @@ from imu_calibration.document.calibration import Calibration, parameter_rows
 from imu_calibration.document.decision import DECISION, HELPS, NOTE, PARAMETERS, UNPROVEN, WARNING
 from imu_calibration.document.verdict import judge, judged
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.status import DETERMINED, HELD, WEAK, tolerances_of
+from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK, tolerances_of
 
 MODEL = SensorModel(reference=('table_tilt',))
 NAMES = list(MODEL.param_names)

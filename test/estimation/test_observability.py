@@ -9,6 +9,8 @@ from imu_calibration.core.units import DEG
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.observability import (
+    MOTIONS,
+    TABLE_MOTIONS,
     added_information,
     needed_motions,
     tolerance_scaled_singular_values,
@@ -16,7 +18,6 @@ from imu_calibration.estimation.observability import (
 )
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 
 GRAVITY = 9.81
 MODEL = SensorModel()

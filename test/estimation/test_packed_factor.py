@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.estimation.triangular import PackedFactor, triangular, unpacked
+from imu_calibration.estimation.scaled_solve import PackedFactor, triangular, unpacked
 
 
 def test_packed_factors_come_back_bit_by_bit():

@@ -5,8 +5,7 @@ import pytest
 
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, dof_factor
 from imu_calibration.estimation.noise_search import NoiseLikelihood
-from imu_calibration.estimation.restricted_likelihood import RestrictedLikelihood, profile
-from imu_calibration.estimation.whitening import Whitening, predict_session_offsets
+from imu_calibration.estimation.whitening import RestrictedLikelihood, Whitening, predict_session_offsets, profile
 
 STEP = 1.3
 """Standard deviation of the bias from recording to recording."""

@@ -1,6 +1,6 @@
 """How well a parameter is known, in one word."""
 
-from imu_calibration.estimation.status import DETERMINED, HELD, WEAK, statuses
+from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK, statuses
 
 
 def test_a_parameter_is_determined_within_its_tolerance_weak_beyond_and_held_where_the_prior_stands():

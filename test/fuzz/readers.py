@@ -29,17 +29,14 @@ from imu_calibration.document.exports.loss import import_file
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import root_of, table_from_urdf
 from imu_calibration.references.gravity.sample_store import HandStore
-from msg_adapters.bag import open_recording
+from msg_adapters.bag import STRING_TYPE, TF_TYPE, description_in, open_recording, static_transforms
 from msg_adapters.csv_log import read_csv
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.definitions import deserializer, is_standard, standard_definition
-from msg_adapters.description import STRING_TYPE, TF_TYPE, description_in, static_transforms
-from msg_adapters.encode import encode_imu, encode_joints, encode_temperature
-from msg_adapters.imu import IMU_TYPE
+from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
 from msg_adapters.layout import Packed
-from msg_adapters.temperature import TEMPERATURE_TYPE
-from msg_adapters.write import write_session
+from msg_adapters.write import encode_imu, encode_joints, encode_temperature, write_session
 
 from worlds.arms import SIX_AXES
 from worlds.compensation_cases import random_calibration

@@ -8,7 +8,7 @@ from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.noise_at_rest import white_noise
+from imu_calibration.estimation.session_noise import white_noise
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.signal_history import BandVariance
 from imu_calibration.kinematics.table import Table

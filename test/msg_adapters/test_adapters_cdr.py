@@ -12,14 +12,18 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.definitions import deserializer, is_standard, standard_definition
-from msg_adapters.encode import encode_imu, encode_joints, encode_temperature
-from msg_adapters.imu import FIELDS, IMU_TYPE, parse_imu, patch_imu
-from msg_adapters.joint_state import JOINT_STATE_TYPE, MISSING_JOINT, NO_POSITION
-from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE, encode_trajectory, trajectory_from_message
-from msg_adapters.layout import MAX_LAYOUTS, Packed
+from msg_adapters.imu import FIELDS, IMU_TYPE, TEMPERATURE_TYPE, parse_imu, patch_imu
+from msg_adapters.joint_state import (
+    JOINT_STATE_TYPE,
+    JOINT_TRAJECTORY_TYPE,
+    MISSING_JOINT,
+    NO_POSITION,
+    encode_trajectory,
+    trajectory_from_message,
+)
+from msg_adapters.layout import LONGEST_NAME, MAX_LAYOUTS, MessageError, Packed, clean_name
 from msg_adapters.live import LiveGatherer
-from msg_adapters.stamps import LONGEST_NAME, MessageError, clean_name
-from msg_adapters.temperature import TEMPERATURE_TYPE
+from msg_adapters.write import encode_imu, encode_joints, encode_temperature
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types

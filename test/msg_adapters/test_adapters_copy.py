@@ -76,7 +76,7 @@ def test_a_failure_leaves_nothing_behind(tmp_path):
 
 
 def test_a_patched_message_keeps_everything_else():
-    from msg_adapters.encode import encode_imu
+    from msg_adapters.write import encode_imu
     data = encode_imu(make_session(3)[0])[1].tobytes()
     patched = patch_imu(data, force_s=(1.0, 2.0, 3.0), frame_id='other')
     before, after = parse_imu(data), parse_imu(patched)

@@ -15,10 +15,9 @@ from test_adapters_bag import make_session
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
-from msg_adapters.compressed import zstd
 from msg_adapters.definitions import standard_definition
-from msg_adapters.encode import encode_imu, encode_joints
-from msg_adapters.write import write_session
+from msg_adapters.mcap_records import zstd
+from msg_adapters.write import encode_imu, encode_joints, write_session
 
 N = 9000
 KINDS = {'sqlite3': {'storage': 'sqlite3'}, 'mcap': {'storage': 'mcap'}, 'mcap_zstd': {'storage': 'mcap', 'compression': 'zstd'},

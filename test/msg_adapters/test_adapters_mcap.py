@@ -11,11 +11,11 @@ from test_adapters_bag import make_session
 from imu_calibration.core.samples import ImuSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.definitions import standard_definition
-from msg_adapters.encode import encode_imu, encode_joints
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
+from msg_adapters.mcap_file import MAGIC, record, text
 from msg_adapters.mcap_records import indexed_messages, walk
-from msg_adapters.mcap_writer import MAGIC, record, text
+from msg_adapters.write import encode_imu, encode_joints
 
 
 def message(channel, stamp_ns, data):

@@ -14,9 +14,9 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.copying import copy_with_corrected
-from msg_adapters.encode import encode_imu, encode_joints
 from msg_adapters.imu import imu_from_rows, imu_row
 from msg_adapters.joint_state import joint_row, joints_from_rows
+from msg_adapters.write import encode_imu, encode_joints
 
 
 def by_rosbags(path, topic, limit=None):

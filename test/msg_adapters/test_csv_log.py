@@ -9,7 +9,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
-from msg_adapters import csv_bag
+from msg_adapters import csv_log
 from msg_adapters.bag import open_recording
 from msg_adapters.csv_log import read_csv
 
@@ -143,12 +143,12 @@ def test_arrays_of_other_shapes_are_refused():
 def test_an_unchanged_log_is_converted_once_and_its_bag_removed_with_its_last_user(tmp_path, imu, monkeypatch):
     path = write(tmp_path / 'log.csv', PLAIN, seconds(imu), imu.force_s, imu.rate_s)
     reads = []
-    monkeypatch.setattr(csv_bag, 'read_csv', lambda path: reads.append(path) or read_csv(path))
+    monkeypatch.setattr(csv_log, 'read_csv', lambda path: reads.append(path) or read_csv(path))
     imu_calibration.calibrate(path, gravity=STANDARD_GRAVITY)
     assert len(reads) == 1
-    bag = csv_bag._converted(path, path.stat().st_mtime_ns, path.stat().st_size).bag
+    bag = csv_log._converted(path, path.stat().st_mtime_ns, path.stat().st_size).bag
     assert bag.exists()
-    csv_bag._converted.cache_clear()
+    csv_log._converted.cache_clear()
     assert not bag.exists()
 
 

@@ -12,8 +12,8 @@ from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.decode import OTHER_FRAME, FrameChoice
 from msg_adapters.definitions import standard_definition
-from msg_adapters.encode import encode_imu, rows
 from msg_adapters.imu import IMU_TYPE
+from msg_adapters.write import encode_imu, rows
 
 from worlds.physics_hand import hold_and_turn
 

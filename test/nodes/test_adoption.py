@@ -9,8 +9,7 @@ from refusal import refused
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.nodes import adoption
-from imu_calibration.nodes.adoption import adopt, again
-from imu_calibration.nodes.compensator_settings import CompensatorSettings
+from imu_calibration.nodes.adoption import CompensatorSettings, adopt, again
 
 from worlds.compensation_cases import random_calibration
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.document.calibration_text import calibration_from_text
-from msg_adapters.encode import encode_imu, encode_joints, rows
+from msg_adapters.write import encode_imu, encode_joints, rows
 
 from worlds.live_sessions import make_session
 

@@ -13,7 +13,7 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.base import Role
 from imu_calibration.preprocessing.stamping import COUNTED, StampLine
-from msg_adapters.encode import encode_imu
+from msg_adapters.write import encode_imu
 
 from worlds.compensation_cases import random_calibration
 
@@ -25,8 +25,8 @@ from sensor_msgs.msg import Imu, Temperature  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
 from imu_calibration.nodes import compensator_diagnostics, compensator_node, inputs  # noqa: E402
+from imu_calibration.nodes.adoption import CompensatorSettings  # noqa: E402
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
-from imu_calibration.nodes.compensator_settings import CompensatorSettings  # noqa: E402
 from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
 from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
 

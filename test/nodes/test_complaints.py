@@ -7,9 +7,12 @@ from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 
 from imu_calibration.calibration.coverage import GroupState  # noqa: E402
 from imu_calibration.calibration.diagnosis.live_diagnosis import DiagnosisState  # noqa: E402
-from imu_calibration.nodes.calibration_guide import PATIENCE, CalibrationGuide  # noqa: E402
-from imu_calibration.nodes.calibration_state import WorkerState  # noqa: E402
-from imu_calibration.nodes.calibration_status import statuses_of  # noqa: E402
+from imu_calibration.nodes.calibration_status import (  # noqa: E402
+    PATIENCE,
+    CalibrationGuide,
+    WorkerState,  # noqa: E402
+    statuses_of,  # noqa: E402
+)
 from imu_calibration.nodes.complaints import MOST_KINDS, REMINDER, Complaints  # noqa: E402
 from imu_calibration.preprocessing.stamping import COUNTED, StampLine  # noqa: E402
 from imu_calibration.preprocessing.stream_watch import StreamState  # noqa: E402

@@ -7,7 +7,7 @@ from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomic
 from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 
 from imu_calibration.core.settings import describe  # noqa: E402
-from imu_calibration.nodes.parameter_files import NODES, settings_of  # noqa: E402
+from imu_calibration.nodes.parameters import NODES, settings_of  # noqa: E402
 from imu_calibration.planning.campaign import CampaignSettings  # noqa: E402
 from imu_calibration.planning.driver import DriverSettings  # noqa: E402
 

@@ -7,8 +7,8 @@ import pytest
 
 from imu_calibration.core.units import DEG
 from imu_calibration.document.calibration_text import calibration_to_text
-from msg_adapters.encode import encode_imu, rows
 from msg_adapters.imu_stream import ImuStream
+from msg_adapters.write import encode_imu, rows
 
 from worlds.drives import drive, plain_calibration
 

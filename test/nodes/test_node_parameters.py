@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from imu_calibration.core.settings import describe, setting
-from imu_calibration.nodes.parameter_files import NODES, main, rendered, settings_of, value_text
+from imu_calibration.nodes.parameters import NODES, main, rendered, settings_of, value_text
 
 ROOT = Path(__file__).resolve().parents[2]
 

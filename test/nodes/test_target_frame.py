@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
-from msg_adapters.encode import encode_imu
+from msg_adapters.write import encode_imu
 
 from worlds.compensation_cases import random_calibration
 
@@ -26,7 +26,7 @@ from std_msgs.msg import String  # noqa: E402
 
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
 from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
-from imu_calibration.nodes.static_frames import TOPIC  # noqa: E402
+from imu_calibration.nodes.robot_stand import TF_STATIC  # noqa: E402
 
 from ros.message_package import make_package, why_not  # noqa: E402
 from ros.one_process import OneProcess  # noqa: E402
@@ -68,7 +68,7 @@ class Bench(OneProcess):
             return
         from tf2_msgs.msg import TFMessage
         if self._publisher is None:
-            self._publisher = self.node.create_publisher(TFMessage, TOPIC, latched_qos())
+            self._publisher = self.node.create_publisher(TFMessage, TF_STATIC, latched_qos())
         self._publisher.publish(TFMessage(transforms=list(self._held.values())))
 
 
@@ -114,11 +114,11 @@ def corrected(node):
 def test_it_waits_and_says_for_what(bench, place):
     node = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link'})
     bench.until(lambda: STATUS in bench.status, 'diagnostics')
-    assert bench.shows(STATUS, "'base_link'", "'imu_link'", TOPIC, level=WARN)
+    assert bench.shows(STATUS, "'base_link'", "'imu_link'", TF_STATIC, level=WARN)
     bench.broadcast(('map', 'odom', [0, 0, 0], [0, 0, 0, 1]))
     bench.until(lambda: bench.shows(STATUS, "'base_link'", "'imu_link'", 'map, odom'), 'what came instead')
     assert node.adopted is None and corrected(node) == [None] * len(MESSAGES)
-    assert bench.heard("'imu_link'", 'map, odom', level='info') == 1 and node.get_subscriptions_info_by_topic(TOPIC)
+    assert bench.heard("'imu_link'", 'map, odom', level='info') == 1 and node.get_subscriptions_info_by_topic(TF_STATIC)
 
 
 def test_with_the_transform_it_corrects_as_with_the_pose_in_parameters(bench, place):

@@ -11,7 +11,7 @@ from refusal import refused
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.estimation.status import DETERMINED
+from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.campaign import IN_VAIN, PATIENCE, TIME_OVER, Campaign, CampaignSettings, Suspect, separator_of, with_suspect

@@ -16,7 +16,7 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.forward_equations import columns
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
-from imu_calibration.estimation.status import tolerances_of
+from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.estimation.window_statistics import batch_statistics
 from imu_calibration.kinematics.motion_limits import limits_of
 from imu_calibration.kinematics.table import Table
@@ -37,7 +37,7 @@ from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.plan import class_in
 from imu_calibration.use_cases.resources import config_file
 from imu_calibration.use_cases.stand import table_of
-from msg_adapters.joint_trajectory import JOINT_TRAJECTORY_TYPE
+from msg_adapters.joint_state import JOINT_TRAJECTORY_TYPE
 
 from worlds.arms import SEVEN_AXES
 from worlds.live_sessions import TABLE, make_session

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
-from imu_calibration.estimation.status import tolerances_of
+from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.kinematics.motion_limits import limits_of
 from imu_calibration.planning.belief import additive_bound, exact_information, least_bias_variance, relax
 from imu_calibration.planning.coordinates import Coordinates

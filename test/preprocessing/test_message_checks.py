@@ -5,8 +5,8 @@ import pytest
 
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.preprocessing.recording_evidence import ABSENT, GOOD, NOTE, OLD, QUANTITIES, WARNING, MessageEvidence, check_messages
-from msg_adapters.encode import encode_imu, rows
 from msg_adapters.imu_stream import ImuHeads
+from msg_adapters.write import encode_imu, rows
 
 KNOWN = np.diag([1e-4, 2e-4, 3e-4])
 NONE = np.diag([ABSENT, 0.0, 0.0])

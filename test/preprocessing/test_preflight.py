@@ -25,9 +25,8 @@ from imu_calibration.simulation.session import random_values, simulate
 from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import standard_definition
-from msg_adapters.encode import encode_imu, rows
 from msg_adapters.imu import IMU_TYPE
-from msg_adapters.write import write_session
+from msg_adapters.write import encode_imu, rows, write_session
 
 from worlds.physics import make_session, write_bag
 from worlds.physics_hand import hold_and_turn

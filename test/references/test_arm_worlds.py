@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.table_calibration import calibrate
-from imu_calibration.estimation.status import HELD, WEAK
+from imu_calibration.estimation.solution import HELD, WEAK
 from imu_calibration.references.options import CalibrationOptions
 
 from worlds.arm_worlds import deviations, in_our_axes, make_arm_world, truth

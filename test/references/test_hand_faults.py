@@ -13,7 +13,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.estimation.covariance_terms import of_fit
-from imu_calibration.estimation.status import reasons_held
+from imu_calibration.estimation.solution import reasons_held
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.rest_detection import find_still

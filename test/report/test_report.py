@@ -21,9 +21,9 @@ from imu_calibration.kinematics import strapdown
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.calibration_page import calibration_report
+from imu_calibration.report.calibration_sections import reading_tables
 from imu_calibration.report.navigation_section import expected_growth, motion_growth, noise_densities
-from imu_calibration.report.numbers import fixed, text
-from imu_calibration.report.readings import reading_tables
+from imu_calibration.report.page import fixed, text
 from imu_calibration.report.residuals import autocorrelation
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES

@@ -177,7 +177,7 @@ class Publisher:
 
     def send(self, imu, joints, per_second=4000):
         """Publish ImuSamples and JointSamples merged by their place in the recording, about so many per second."""
-        from msg_adapters.encode import encode_imu, encode_joints, rows
+        from msg_adapters.write import encode_imu, encode_joints, rows
         queue = []
         for publisher, samples, encode in ((self.imu, imu, encode_imu), (self.joints, joints, encode_joints)):
             messages = rows(encode(samples)) if len(samples) else []

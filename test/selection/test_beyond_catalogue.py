@@ -13,7 +13,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.document import files
 from imu_calibration.effects.expressions import ColumnGroup
 from imu_calibration.selection import proposals
-from imu_calibration.selection.grammar import grammar
+from imu_calibration.selection.formulas import grammar
 from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.proposals import propose
 from imu_calibration.selection.regime_variables import variables_of

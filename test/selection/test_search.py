@@ -10,16 +10,14 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
-from imu_calibration.estimation.noise_search import FLICKER, NoiseLikelihood
+from imu_calibration.estimation.noise_search import FLICKER, BiasProcessSearch, NoiseLikelihood
 from imu_calibration.selection import gain, investigation
 from imu_calibration.selection import unexplained as rests
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.bias_process_search import BiasProcessSearch
 from imu_calibration.selection.evidence import Evidence, WindowEvidence, folds_of, locked_windows
 from imu_calibration.selection.explained_share import SHOWS, Explained, ExplainedWindows, pruned
 from imu_calibration.selection.noise_beside_effects import _needed_smooth, drift_prior, natural_processes, plausible_processes
-from imu_calibration.selection.normal_matrices import scatter_of_each, white_means
-from imu_calibration.selection.parameter_space import ParameterSpace, parameter_space
+from imu_calibration.selection.parameter_space import ParameterSpace, parameter_space, scatter_of_each, white_means
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import LEAST_GAIN, Search
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.report.spectrum_figure import draw_tones
+from imu_calibration.report.figures import draw_tones
 from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.spectrum import _without, find_tones, of_stretches
 

@@ -18,7 +18,7 @@ from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.options import CalibrationOptions, choose_model
-from imu_calibration.selection.linearisation import PASSES, linearise_again
+from imu_calibration.selection.questions import PASSES, linearise_again
 
 from worlds.misfit_worlds import CAUSES, make_pair
 

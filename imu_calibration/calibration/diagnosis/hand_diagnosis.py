@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
-from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding
-from imu_calibration.calibration.diagnosis.separating_motion import motions_of
+from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.calibration.hand_by_evidence import extended_by_hand
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.status import HELD
+from imu_calibration.estimation.solution import HELD, Solution
 from imu_calibration.references.gravity.effect_rows import Block
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, HandData
 from imu_calibration.references.gravity.hand_options import HandOptions

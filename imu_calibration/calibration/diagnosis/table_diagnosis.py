@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, parameters_of
-from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, sentence
-from imu_calibration.calibration.diagnosis.separating_motion import motions_of_one_joint, separating_motion
+from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of_one_joint, sentence, separating_motion
 from imu_calibration.calibration.diagnosis.traces import residual_traces
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel

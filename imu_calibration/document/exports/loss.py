@@ -30,7 +30,7 @@ from imu_calibration.document.exports.target import Numbers, Read, Readings, Tar
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.status import HELD, WEAK
+from imu_calibration.estimation.solution import HELD, WEAK
 from imu_calibration.kinematics.rotations import Reference
 
 SECONDS, SAMPLES_PER_SECOND = 60.0, 50

@@ -7,13 +7,13 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.sensor_model import BASE
+from imu_calibration.estimation.noise_search import NATURAL
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.references.gravity.equations import TurnData, between_middles, tangent
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.selection.bias_process_search import NATURAL
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
 from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, Terms, replace_weak, sd_without, total, with_term
 from imu_calibration.estimation.model_error import ModelError
-from imu_calibration.estimation.status import HELD, statuses, tolerances_of
+from imu_calibration.estimation.solution import HELD, statuses, tolerances_of
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import bias_movements, with_movement, without_movement
 from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State
@@ -23,9 +23,8 @@ from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, Hand
 from imu_calibration.references.gravity.pose_outliers import possible_turns, without_outliers
 from imu_calibration.references.gravity.pose_solver import first_state, solve_joint
 from imu_calibration.references.gravity.poses import average_poses, distinct_attitudes, noise_statistics
-from imu_calibration.references.gravity.turns import collect_turns, known_turn_data, sample_times
-from imu_calibration.references.gravity.turns_within_range import full_scale_factor
-from imu_calibration.selection.linearisation import at_time_constants
+from imu_calibration.references.gravity.turns import collect_turns, full_scale_factor, known_turn_data, sample_times
+from imu_calibration.selection.questions import at_time_constants
 
 GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
 """x along the accelerometer's x input axis, y in the plane of its x and y input axes."""

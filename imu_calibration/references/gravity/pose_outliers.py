@@ -9,7 +9,7 @@ from imu_calibration.core.distributions import chance_of_fall
 from imu_calibration.estimation.row_estimate import RowEstimate
 from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.references.gravity.turns_within_range import missed_angle
+from imu_calibration.references.gravity.turns import missed_angle
 
 P_VALUE = 1e-3
 """False positive rate for a recording without outliers, per kind."""

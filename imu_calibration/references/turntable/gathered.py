@@ -1,15 +1,215 @@
-"""The result of the map step of a calibration, and the merge of the results of several recordings."""
+"""Gathered windows of sessions on a table: stored, held out for the proof, merged."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from imu_calibration.core.errors import ImuCalibrationError, InputError
-from imu_calibration.estimation.accumulator import Accumulator
-from imu_calibration.estimation.window_statistics import WindowStatistics
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.forward_equations import columns
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.accumulator import Accumulator, restrict, selected_columns, stack
+from imu_calibration.estimation.prior import fixed_parameters, make_prior
+from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.weighted_system import WeightedSystem
+from imu_calibration.estimation.window_statistics import AXES, WindowStatistics, count_pieces, pieces_at_rest, reduce_window
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.references.turntable.held_out import HeldOut
+
+STATIC_MOST = 4096
+"""Static windows kept at most."""
+
+
+class WindowStore:
+    """
+    All windows of a session as long as they fit, none of them afterwards.
+
+    A static window is stored as its reduced form with one row of motion; of other windows every sample is kept.
+
+    Parameters
+    ----------
+    most : int
+        Samples in moving windows that are kept at most.
+    complete : bool
+        False when windows were missed already, as after a restart.
+
+    """
+
+    def __init__(self, most: int, complete: bool = True):
+        self._most, self._entries, self._n_samples, self._n_static = most, [], 0, 0
+        self.complete = complete and most > 0
+
+    def copy(self) -> 'WindowStore':
+        """Return a copy that shares the windows."""
+        twin = WindowStore(self._most, self.complete)
+        twin._entries, twin._n_samples, twin._n_static = list(self._entries), self._n_samples, self._n_static
+        return twin
+
+    def add(self, window: Window, reduced: WindowStatistics) -> None:
+        """Add a copy of one window (`owned_window`), and its statistics; when it does not fit, discard all windows."""
+        if not self.complete:
+            return
+        if window.kind == 'static':
+            self._n_static += 1
+            temperature = None if window.temperature_c is None else np.array([window.temperature_c.mean()])
+            self._entries.append((reduced, window.motion, temperature))
+        else:
+            self._n_samples += len(window)
+            self._entries.append(window)
+        if self._n_samples > self._most or self._n_static > STATIC_MOST:
+            self.complete, self._entries = False, []
+
+    def reduced(self, model: SensorModel, table: Table, session: int) -> Iterator[WindowStatistics]:
+        """Yield all windows in order with the columns of `model`, as `calibration.collector` reduces them."""
+        for entry in self._entries:
+            if isinstance(entry, Window):
+                yield reduce_window(entry, model, table, session=session, with_pieces=True)
+            else:
+                yield _again(entry, model, table)
+
+
+def _again(entry, model, table):
+    """Return a static window's statistics with recomputed columns."""
+    reduced, motion, temperature = entry
+    sensors = {name: replace(known, mean=np.concatenate([columns(model, name, table, motion=motion, temperature_c=temperature).mean(axis=0),
+                                                         known.mean[-3:]]))
+               for name, known in reduced.sensors.items()}
+    return replace(reduced, sensors=sensors, pieces={name: pieces_at_rest(known.mean, reduced.duration) for name, known in sensors.items()})
+
+
+def owned_window(window: Window) -> Window:
+    """Return a copy of the window in separate memory: slices would keep the complete chunk in memory."""
+    motion = JointMotion.joined([window.motion])
+    temperature = None if window.temperature_c is None else np.array(window.temperature_c)
+    return Window(window.kind, window.stamp_ns.copy(), window.time.copy(), window.force_s.copy(), window.rate_s.copy(), motion, temperature,
+                  joint_step=window.joint_step)
+
+
+FOLDS = 8
+"""Folds of the cross-validation."""
+BLOCKS = 3 * FOLDS
+"""Blocks that are resampled for an interval; block k belongs to fold k modulo FOLDS."""
+
+
+@dataclass(eq=False)
+class HeldOutBlock:
+    """Every so many-th window of each kind."""
+
+    accumulator: Accumulator = field(default_factory=lambda: Accumulator(in_blocks=False, share=BLOCKS))
+    """For fitting."""
+    pieces: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
+    """(sensor, regime) -> triangular factor of the rows of short pieces, for judging."""
+    counts: dict[str, int] = field(default_factory=dict)
+    """Regime -> number of pieces."""
+    judged: int = 0
+    """Windows with kept pieces."""
+
+    def add(self, window: WindowStatistics, judged: bool = True) -> None:
+        """Add a window, and its pieces if it is judged."""
+        self.accumulator.add(window)
+        if not judged:
+            return
+        self.judged += 1
+        for sensor in SENSORS:
+            for regime, rows in window.pieces[sensor].items():
+                stack(self.pieces, (sensor, regime), rows if len(rows) <= rows.shape[1] else triangular(rows))
+        for regime, rows in window.pieces[SENSORS[0]].items():
+            count = count_pieces(window.duration) if window.kind == 'static' else len(rows)
+            self.counts[regime] = self.counts.get(regime, 0) + count
+
+    def merge(self, other: 'HeldOutBlock') -> None:
+        """Add the content of another block."""
+        self.accumulator.merge(other.accumulator)
+        for key, factor in other.pieces.items():
+            stack(self.pieces, key, factor)
+        for regime, count in other.counts.items():
+            self.counts[regime] = self.counts.get(regime, 0) + count
+        self.judged += other.judged
+
+    def copy(self) -> 'HeldOutBlock':
+        """Return an independent copy."""
+        return HeldOutBlock(self.accumulator.copy(), dict(self.pieces), dict(self.counts), self.judged)
+
+    def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOutBlock':
+        """Return the block with the columns of the model `narrow` only."""
+        chosen = {sensor: np.concatenate([columns[:-AXES], np.arange(-2 * AXES, 0)])
+                  for sensor, columns in selected_columns(wide, narrow).items()}
+        return HeldOutBlock(restrict(self.accumulator, wide, narrow), {key: rows[:, chosen[key[0]]] for key, rows in self.pieces.items()},
+                            self.counts, self.judged)
+
+
+@dataclass(eq=False)
+class HeldOut:
+    """
+    Blocks of windows.
+
+    Undivided windows of each kind are assigned to blocks in turn, so that every block has windows of each kind, and memory does not grow
+    with the session.
+    """
+
+    blocks: list[HeldOutBlock] = field(default_factory=lambda: [HeldOutBlock() for _ in range(BLOCKS)])
+
+    def add(self, window: WindowStatistics, judged: bool = True) -> None:
+        """Add a window, and its pieces if it is judged."""
+        dealt = sum(block.accumulator.windows.get(window.kind, 0) for block in self.blocks)
+        self.blocks[dealt % BLOCKS].add(window, judged)
+
+    def merge(self, other: 'HeldOut') -> None:
+        """Add the content of another object; its windows follow the existing ones."""
+        for mine, its in zip(self.blocks, other.blocks):
+            mine.merge(its)
+
+    def copy(self) -> 'HeldOut':
+        """Return an independent copy."""
+        return HeldOut([block.copy() for block in self.blocks])
+
+    def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOut':
+        """Return the same with the columns of the model `narrow` only."""
+        return self if wide is narrow else HeldOut([block.restricted(wide, narrow) for block in self.blocks])
+
+    @property
+    def n_windows(self) -> int:
+        """Windows dealt out."""
+        return sum(sum(block.accumulator.windows.values()) for block in self.blocks)
+
+    @property
+    def n_judged(self) -> int:
+        """Windows with kept pieces."""
+        return sum(block.judged for block in self.blocks)
+
+    def values_without(self, solution: Solution) -> list[np.ndarray]:
+        """
+        Return the parameters without each fold: one Gauss-Newton step from the solution, on the rows of the remaining folds.
+
+        Noise and held parameters are those of the solution; a parameter that only the fold determines is set to its prior.
+        """
+        model, prior, values = solution.model, make_prior(solution.model), solution.values
+        free = ~fixed_parameters(model) & ~solution.held
+        parts = [_linearised(self.blocks[fold::FOLDS], solution, prior) for fold in range(FOLDS)]
+        known = np.column_stack([prior.root, prior.root @ (values - prior.mean)])
+        found = []
+        for fold in range(FOLDS):
+            rows = np.concatenate([known, *(part for k, part in enumerate(parts) if k != fold)])
+            moved = values.copy()
+            moved[free] -= scaled_lstsq(rows[:, :-1][:, free], rows[:, -1])
+            found.append(moved)
+        return found
+
+
+def _linearised(blocks, solution, prior):
+    """Return the triangular factor of ``[derivative of the residuals | residuals]`` of all windows of some blocks, weighed by noise."""
+    n_params, rows = len(solution.values), []
+    for block in blocks:
+        if block.accumulator.rows:
+            system = WeightedSystem(block.accumulator, solution.model, prior)
+            factors = {sensor: system.factors(sensor, solution.noise[sensor]) for sensor in SENSORS}
+            residuals = system.residuals(solution.values, factors)[:-len(prior.root)]
+            rows.append(np.column_stack([system.jacobian(solution.values, factors), residuals]))
+    return triangular(np.concatenate(rows)) if rows else np.zeros((0, n_params + 1))
+
 
 MOST_SAMPLES = 100_000
 """Most samples kept; beyond it every second window of each kind is removed."""
