@@ -21,7 +21,7 @@ from imu_calibration.document.calibration import one_significant
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import BARE, SensorModel
 from imu_calibration.estimation.prior import make_prior
-from imu_calibration.estimation.solution import SURE, Solution
+from imu_calibration.estimation.solution import CONVENTION_SHARE, Solution
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions, choose_model
@@ -222,7 +222,7 @@ def stands_out(solution: Solution, question: Question) -> bool:
     if not one_significant(far, np.sqrt(np.diag(solution.covariance)[at])):
         return False
     sizes, directions = np.linalg.eigh(solution.covariance[np.ix_(at, at)])
-    known = sizes > SURE * sizes[-1]   # the lever arms of three sensors sum to zero by convention
+    known = sizes > CONVENTION_SHARE * sizes[-1]   # the lever arms of three sensors sum to zero by convention
     return bool(chi2_sf(((directions.T @ far)[known]**2 / sizes[known]).sum(), known.sum()) < FAMILY_WISE)
 
 

@@ -262,7 +262,7 @@ RADIUS = 0.5
 """Of the sphere, m; the picture has no scale of its own but that of the arms, which are drawn larger."""
 ARMS_TIMES = 10.0
 """Arms are millimetres."""
-WANTED, SEEN, DONE, ARROW, NOW, WHITE = ((0.95, 0.55, 0.1), (0.25, 0.6, 0.95), (0.2, 0.75, 0.3), (0.9, 0.1, 0.5), (0.5, 0.5, 0.6),
+WANTED, VISITED, DONE, ARROW, NOW, WHITE = ((0.95, 0.55, 0.1), (0.25, 0.6, 0.95), (0.2, 0.75, 0.3), (0.9, 0.1, 0.5), (0.5, 0.5, 0.6),
                                          (0.9, 0.9, 0.9))
 TINY = 0.03
 

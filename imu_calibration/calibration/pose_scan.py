@@ -20,7 +20,7 @@ from imu_calibration.references.gravity.turns import collect_turns
 
 FACES = {f'{sign}{axis}': direction for axis, unit in zip('xyz', np.eye(3)) for sign, direction in (('+', unit), ('-', -unit))}
 """The six directions that can be turned up."""
-SEEN = np.pi / 4
+FACE_REACH = np.pi / 4
 """A face counts as seen when an attitude lies within this angle of it, rad."""
 
 
@@ -94,7 +94,7 @@ def unseen(found: Findings) -> list[str]:
         return list(FACES)
     up = found.poses.force / np.linalg.norm(found.poses.force, axis=1, keepdims=True)
     nearest = {name: float(np.arccos(np.clip(up @ face, -1, 1)).min()) for name, face in FACES.items()}
-    return sorted((name for name, angle in nearest.items() if angle > SEEN), key=lambda name: -nearest[name])
+    return sorted((name for name, angle in nearest.items() if angle > FACE_REACH), key=lambda name: -nearest[name])
 
 
 def _needs(found, not_seen, calibration, *, step, hints):

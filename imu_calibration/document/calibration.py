@@ -259,7 +259,7 @@ def _stays(effect, sensors):
 
 MISFIT = 10.0
 """Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
-LOOSE = 2.0
+NOTED_MISFIT = 2.0
 """From this factor on the misfit is worth a note."""
 SHOWN_NAMES = 6
 """Names listed one by one; of more, the groups are named."""

@@ -90,7 +90,7 @@ def _is_proof(value):
 
 
 _SECTION = {'effects': _is_list_of(_is_text)}
-KNOWN = {
+KEYS_OF_PARTS = {
     **{section: _SECTION for section in SECTIONS}, 'covariance': {}, 'covariance_terms': {},
     'frame_id': _is_text, 'reference_temperature_c': lambda value: _is_number(value, *RANGE_C),
     'joint_names': lambda value: _is_list_of(_is_text)(value) and len(set(value)) == len(value) <= MOST_JOINTS,
@@ -105,7 +105,7 @@ KNOWN = {
 """Part of a document -> requirement if present: a function, or a mapping with requirements of its entries."""
 
 
-def check_parts(document: Mapping, known: Mapping = KNOWN, place: str = '') -> None:
+def check_parts(document: Mapping, known: Mapping = KEYS_OF_PARTS, place: str = '') -> None:
     """
     Refuse a document in which a part of `known` has another type or range; other parts are not checked.
 

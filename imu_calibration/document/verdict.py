@@ -7,8 +7,8 @@ import numpy as np
 from imu_calibration.core.units import for_people, significant
 from imu_calibration.document.calibration import (
     HAND_AXES,
-    LOOSE,
     MISFIT,
+    NOTED_MISFIT,
     SHOWN_NAMES,
     Calibration,
     beyond_known,
@@ -109,7 +109,7 @@ def misfits(calibration: Calibration) -> list[Reason]:
                    f'the model is incomplete{", although the calibration helps in each regime" if helps else ""}',
                    'find the cause', key='diagnose', sensors=(sensor,))
             for sensor in SENSORS for helps in [rested(calibration) and helps_everywhere(calibration.proof.get(sensor))]
-            for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > LOOSE]
+            for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > NOTED_MISFIT]
 
 
 def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:

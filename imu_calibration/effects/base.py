@@ -21,7 +21,7 @@ SECTIONS = SENSORS + ('reference',)
 VECTOR = AXES
 OTHERS = tuple(f'{row}_{column}' for row in AXES for column in AXES if row != column)
 MATRIX = tuple(row + column for row in AXES for column in AXES)
-KNOWN = 10.0
+IMPLAUSIBLE_RATIO = 10.0
 """No instrument is known of with an effect beyond this many times the largest plausible size."""
 PRODUCTS = tuple(f'{row}_{pair}' for row in AXES for pair in ('xy', 'yz', 'xz'))
 
@@ -189,7 +189,7 @@ class Effect:
 
     def surpasses(self, amplitudes: np.ndarray, sd: np.ndarray | float = 0.0) -> bool:
         """Return whether amplitudes exceed those of any known instrument by more than three standard deviations."""
-        return bool(np.max(np.abs(amplitudes) - 3 * sd) > KNOWN * self.largest)
+        return bool(np.max(np.abs(amplitudes) - 3 * sd) > IMPLAUSIBLE_RATIO * self.largest)
 
     def prior_values(self) -> np.ndarray:
         """Return the prior values, shape (size,)."""

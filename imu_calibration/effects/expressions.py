@@ -33,7 +33,7 @@ QUANTITIES: dict[str, dict[str, tuple]] = {
 Quantity -> {name in a text: where a Reference holds it}: true specific force, rate and angular acceleration in s, level frame to s, joints
 from the base outwards.
 """
-KNOWN = ('f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time, temperature_c, thermal_branch, '
+VOCABULARY = ('f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time, temperature_c, thermal_branch, '
          'vibration_x .. z, temperature_ref_c, tau')
 """The names, for messages."""
 PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
@@ -92,7 +92,7 @@ class _Refused(Exception):
 
 def _refusal(text, place, why):
     shown = ' '.join(str(text)[place:place + 30].split())
-    return InputError(f'a column must be arithmetic of at most {LONGEST} characters in {KNOWN} with {", ".join(FUNCTIONS)} and '
+    return InputError(f'a column must be arithmetic of at most {LONGEST} characters in {VOCABULARY} with {", ".join(FUNCTIONS)} and '
                       f'powers up to {HIGHEST_POWER}, got {why} at character {place + 1}: {shown!r}; correct it', code='not_arithmetic')
 
 

@@ -8,11 +8,11 @@ from imu_calibration.estimation.noise_model import MovingFactors, NoiseModel
 
 APART = 2.0
 """The parts have separate weights above this ratio of their residual variances, fast over slow; below it all samples count alike."""
-SURE = 2.0
+CAUTIOUS_SDS = 2.0
 """The residual variance of the slow part is raised by this many of its standard deviations, in comparison and use."""
-STRONG = 1e-6
+DESIGN_EIGENVALUE_SHARE = 1e-6
 """Directions of a scaled design with less than this share of the largest eigenvalue do not count."""
-SEEN = 1e-9
+RESIDUAL_EIGENVALUE_SHARE = 1e-9
 """The same for the least residual."""
 WEIGHTLESS = 1e6
 """Factor on a variance that makes the weight negligible."""
@@ -68,7 +68,7 @@ def band_misfit(total: np.ndarray, dof_total: float, slow: np.ndarray, *, dof_sl
         return BandMisfit(overall, np.zeros(3), overall, np.zeros(3, bool))
     of_slow = slow / dof_slow
     of_fast = np.maximum(total - slow, 0.0) / max(dof_total - dof_slow, 1)
-    cautious = of_slow * (1 + SURE * np.sqrt(2 / dof_slow))
+    cautious = of_slow * (1 + CAUTIOUS_SDS * np.sqrt(2 / dof_slow))
     apart = of_fast > APART * cautious
     return BandMisfit(overall, np.where(apart, cautious, of_slow), of_fast, apart)
 
@@ -98,7 +98,7 @@ def misfit_along(products: np.ndarray) -> tuple[float, int]:
     scale = _scales(np.einsum('kii->ki', gram))
     eigenvalues, vectors = np.linalg.eigh(gram * scale[:, :, None] * scale[:, None, :])
     along = np.einsum('kij,ki->kj', vectors, gradient * scale)
-    strong = eigenvalues > STRONG * eigenvalues[:, -1:]
+    strong = eigenvalues > DESIGN_EIGENVALUE_SHARE * eigenvalues[:, -1:]
     return float((along**2 * strong / np.where(strong, eigenvalues, 1.0)).sum()), int(strong.sum())
 
 
@@ -107,7 +107,7 @@ def least_misfit(products: np.ndarray) -> tuple[float, int]:
     scale = np.append(_scales(np.diag(products)[:-1]), 1 / np.sqrt(max(products[-1, -1], 1e-300)))
     scaled = products * np.outer(scale, scale)
     eigenvalues, vectors = np.linalg.eigh(scaled[:-1, :-1])
-    seen = eigenvalues > SEEN * max(eigenvalues[-1], 1e-300)
+    seen = eigenvalues > RESIDUAL_EIGENVALUE_SHARE * max(eigenvalues[-1], 1e-300)
     along = (vectors.T @ scaled[:-1, -1])[seen]
     return max(scaled[-1, -1] - (along**2 / eigenvalues[seen]).sum(), 0.0) / scale[-1]**2, int(seen.sum())
 

@@ -29,11 +29,13 @@ SLOW_WAVES = 3
 """Cosines that show a drift."""
 CHANCE = 0.01
 """False positive rate per sensor, for a drift and for model error."""
-UNSEEN = 1.5
-"""Factor on the excess variance over noise: model error that is equal in every block causes no scatter between blocks."""
+COMMON_ERROR_FACTOR = 1.5
+"""Factor on the excess variance of a group over noise: model error that is equal in every block causes no scatter between blocks."""
+COMMON_MEAN_FACTOR = 1.5
+"""Factor on the scatter of means in the variance of an accelerometer's bias, which absorbs an error with a mean as large as its scatter."""
 NO_BIAS = 30.0
 """Biases wander with longer correlation times than this, s."""
-SEEN = 1e-6
+LEAST_SHARE_OF_DATA = 1e-6
 """Share of a parameter's variance that must come from the recording."""
 
 
@@ -74,7 +76,8 @@ def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, No
     waves = _waves_of_blocks(*block_scores(system, values, noises), system.prior.root, free)
     found, misfits = errors_of_waves(waves, system.model)
     if 'accelerometer' in misfits:   # an error that depends on the attitude has a mean as large as its scatter, absorbed by the bias
-        found.scatter_variance[system.model.part('accelerometer', Role.OFFSET)] += UNSEEN * _scatter_of_means(noises['accelerometer'])
+        offset = system.model.part('accelerometer', Role.OFFSET)
+        found.scatter_variance[offset] += COMMON_MEAN_FACTOR * _scatter_of_means(noises['accelerometer'])
     return found
 
 
@@ -202,7 +205,7 @@ class Waves:
         self.places, self.moved, self.expected = places, moved, expected
         self.walk = 1 / (np.pi * np.arange(1, len(moved) + 1))**2
         """Variance of each cosine of a random walk that has unit variance after the whole recording."""
-        self._seen = np.all(np.einsum('kii->ki', expected) > SEEN * np.diag(covariance), axis=0)
+        self._seen = np.all(np.einsum('kii->ki', expected) > LEAST_SHARE_OF_DATA * np.diag(covariance), axis=0)
 
     def group(self, part: slice) -> np.ndarray:
         """Return the indices among the free parameters of one effect with information from the recording."""
@@ -246,7 +249,7 @@ class Waves:
         moved = self.moved[:, group]
         ratio = np.einsum('ki,kij,kj->k', moved, self._inverse(group), moved).sum() / moved.size
         single = (moved**2 / np.einsum('kii->ki', self.expected)[:, group]).mean(axis=0)
-        return float(chi2_sf(ratio * moved.size, moved.size)), 1.0 + UNSEEN * np.maximum(0.5 * (single + ratio) - 1.0, 0.0)
+        return float(chi2_sf(ratio * moved.size, moved.size)), 1.0 + COMMON_ERROR_FACTOR * np.maximum(0.5 * (single + ratio) - 1.0, 0.0)
 
     def _inverse(self, group):
         return np.array([inverse_normal(expected) for expected in self.expected[:, group][:, :, group]])

@@ -18,7 +18,7 @@ from imu_calibration.estimation.scaled_solve import covariance_with_held
 
 ITERATIONS = 15
 """Largest number of Gauss-Newton steps; four to six are usual."""
-LOOSE = 1e4
+FLAT_PRIOR_FACTOR = 1e4
 """Factor on the prior sds for an estimate from the data: large enough to remove the priors, small enough for rounding."""
 
 
@@ -95,8 +95,8 @@ def estimate_rows(reference: RowReference, state: Any, *, fallback: np.ndarray) 
     held = choose_held(_factor(reference.linearise(state), scatter), priors, asked)
     free = asked & ~held
     state = replace(state, values=np.where(held, reference.nominal, state.values))
-    state, scatter, more = _iterate(reference, state, free, LOOSE * priors, variance=np.maximum(scatter.variance, 0.01 * fallback),
-                                    fallback=fallback)
+    start = np.maximum(scatter.variance, 0.01 * fallback)
+    state, scatter, more = _iterate(reference, state, free, FLAT_PRIOR_FACTOR * priors, variance=start, fallback=fallback)
     rows = reference.linearise(state)
     factor = _factor(rows, scatter)
     own, of_held = covariance_with_held(factor, free, held, prior_sd=priors)
@@ -124,7 +124,7 @@ def choose_held(factor: np.ndarray, priors: np.ndarray, asked: np.ndarray) -> np
 
 def _data_sd(scaled):
     """Return the sd of parameters in units of their priors, nearly unlimited without information from the data."""
-    factor = np.linalg.qr(np.vstack([scaled, np.eye(scaled.shape[1]) / LOOSE]), mode='r')
+    factor = np.linalg.qr(np.vstack([scaled, np.eye(scaled.shape[1]) / FLAT_PRIOR_FACTOR]), mode='r')
     return np.linalg.norm(scipy.linalg.solve_triangular(factor, np.eye(len(factor))), axis=1)
 
 

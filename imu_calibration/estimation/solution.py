@@ -135,7 +135,7 @@ class Solution:
         return self.values[self.model.slices[sensor, effect]]
 
 
-SURE = 1e-9
+CONVENTION_SHARE = 1e-9
 """Directions of a covariance, scaled to a unit diagonal, below this share of the largest are conventions."""
 
 
@@ -164,7 +164,7 @@ def shrunk(solution: Solution, parts: list[slice]) -> Solution:
             continue
         sd = np.sqrt(np.diag(covariance)[at])
         sizes, directions = np.linalg.eigh(covariance[np.ix_(at, at)] / np.outer(sd, sd))
-        known = sizes > SURE * sizes[-1]
+        known = sizes > CONVENTION_SHARE * sizes[-1]
         far = directions[:, known].T @ ((values[at] - prior[at]) / sd)
         chi2 = float((far**2 / sizes[known]).sum())
         step = directions[:, known] @ (far / sizes[known]) / sd   # inverse covariance times the distance

@@ -15,7 +15,7 @@ from imu_calibration.estimation.prior import Prior
 from imu_calibration.estimation.scaled_solve import triangular
 from imu_calibration.estimation.whitening import Whitening
 
-LOOSE = 1e3
+EXCLUDED_MEAN_SD_FACTOR = 1e3
 """Sd factor of an excluded mean over the largest sd of all means."""
 
 
@@ -83,7 +83,7 @@ class WeightedSystem:
                                                                                             keys=self.keys)
         if noise.left_out:
             out = np.array([key in noise.left_out for key in self.keys])
-            variance[out] = LOOSE**2 * (variance.max(axis=0) + noise.offset_sd**2 + noise.bias_variance)
+            variance[out] = EXCLUDED_MEAN_SD_FACTOR**2 * (variance.max(axis=0) + noise.offset_sd**2 + noise.bias_variance)
         return variance
 
     def whitened(self, rows: np.ndarray, noise: NoiseModel) -> np.ndarray:

@@ -17,8 +17,8 @@ from imu_calibration.calibration.coverage import (
     DONE,
     NOW,
     RADIUS,
-    SEEN,
     TINY,
+    VISITED,
     WHITE,
     Coverage,
     GroupState,
@@ -239,7 +239,7 @@ def _cells(coverage):
 
 def _seen(coverage):
     if len(coverage.seen):
-        marker = _marker('seen', 0, Marker.SPHERE_LIST, color=SEEN, scale=(TINY,) * 3)
+        marker = _marker('seen', 0, Marker.SPHERE_LIST, color=VISITED, scale=(TINY,) * 3)
         marker.points = [_point(1.1 * RADIUS * up) for up in coverage.seen]
         yield marker
     if coverage.up is not None:

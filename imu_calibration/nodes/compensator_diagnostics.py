@@ -25,7 +25,7 @@ ANOTHER_RATE = 0.1
 COLD = 10.0
 """Seconds without a temperature after which diagnostics report it; drivers send one per second."""
 HEALTH_LEVELS = {WAITING: OK, HOLDS: OK, FOLLOWED: OK, MOVED: WARN, HARMS: ERROR, UNIT: ERROR}
-KNOWN = {'no temperature yet': 'the calibration has thermal effects and no temperature was received: no messages are published',
+TEXT_OF_REASON = {'no temperature yet': 'the calibration has thermal effects and no temperature was received: no messages are published',
          'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
          'not finite': 'readings are not finite: these messages are not published',
          'covariance not finite': ("received covariances are invalid (not finite, or a variance below zero): "
@@ -137,7 +137,7 @@ class CompensatorDiagnostics:
     def _line(self, reason, compensation):
         if reason.startswith('frame_id'):
             return f"messages carry {reason}, the calibration is for '{compensation.frame_id}': they are not corrected"
-        return KNOWN.get(reason, f'{reason}: these messages are not published')
+        return TEXT_OF_REASON.get(reason, f'{reason}: these messages are not published')
 
     def _outside(self, compensation):
         fastest, compensation.fastest_squared = sqrt(compensation.fastest_squared), 0.0

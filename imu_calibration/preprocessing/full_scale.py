@@ -146,7 +146,7 @@ LEAST_TURN = 1.0
 LEAST_EXPLAINED = 0.5
 WIDTH = 4.0
 """Factor on standard deviations for the correlation of errors of neighbouring chunks."""
-SURE = 0.15
+DETERMINED_SD_SHARE = 0.15
 """A direction is determined when the standard deviation of its column is below this share of its length."""
 
 
@@ -221,7 +221,7 @@ def _fit(direction, change, turn_time, rate):
     rest = float(((target - design @ solution)**2).sum())
     sd = WIDTH * np.sqrt(np.diag(inverse) * rest / max(len(target) - 3 * width, 1)).reshape(3, width)[:, :-1]
     matrix = solution.reshape(3, width)[:, :-1]
-    return matrix, np.linalg.norm(sd, axis=0) < SURE * np.linalg.norm(matrix, axis=0), 1.0 - rest / float((target**2).sum())
+    return matrix, np.linalg.norm(sd, axis=0) < DETERMINED_SD_SHARE * np.linalg.norm(matrix, axis=0), 1.0 - rest / float((target**2).sum())
 
 
 def _pairs(chunks):

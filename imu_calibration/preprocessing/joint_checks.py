@@ -115,7 +115,7 @@ def _words(spans):
     return ', '.join(words) + (f' and {len(spans) - 3} times more' if len(spans) > 3 else '')
 
 
-SEEN = {'accelerometer': 0.03, 'gyroscope': 0.01}
+LEAST_POWER_SHARE = {'accelerometer': 0.03, 'gyroscope': 0.01}
 """Directions in which the reference has less than this share of its largest power are not used."""
 RELATED = 0.5
 """Smallest squared correlation for a check of factors and axes."""
@@ -184,7 +184,7 @@ def _moments(accumulator, model, sensor):
 def _seen(sensor, moment):
     """Return (projector on the directions that the reference shows, inverse of its moment there)."""
     values, vectors = np.linalg.eigh(moment)
-    shown = values > SEEN[sensor] * values.max()
+    shown = values > LEAST_POWER_SHARE[sensor] * values.max()
     vectors = vectors[:, shown]
     return vectors @ vectors.T, vectors @ np.diag(1.0 / values[shown]) @ vectors.T
 

@@ -81,7 +81,7 @@ def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:
 
 SAME = 0.5
 """Smallest share of the measured rates that the reference explains on the same table, as a squared correlation."""
-SURE = 0.8
+LEAST_SHARE_EXPLAINED = 0.8
 """Smallest share explained of an exchange that is reported."""
 PIECE = 5.0
 """Duration of the pieces of a recording that are tested separately, s."""
@@ -140,7 +140,7 @@ def find_exchange(windows: Sequence[Window], table: Table) -> Exchange | None:
     for chosen, span in ((tested[piece], None), (part, (float(time[part].min()), float(time[part].max())))):
         (order, signs), axes, instead, share = _best(measured[chosen], motion.select(chosen), table)
         joints = _joint_phrases(table.joint_names, order, signs)
-        if share >= SURE and (joints or _axis_phrases(axes)):
+        if share >= LEAST_SHARE_EXPLAINED and (joints or _axis_phrases(axes)):
             return Exchange(joints, _axis_phrases(axes), _axis_phrases(instead) if joints else (), share, span)
     return None
 
@@ -256,7 +256,7 @@ def _a_period_late(windows, table):
     """Return the finding for streams of a repeating motion that agree clearly better a period earlier or later, or None."""
     shift, share, unshifted, ambiguous = _best_shift(windows, table)
     # opposite rates: a wrong sign, or half a period
-    if ambiguous or abs(shift) <= LEAST_SHIFT or unshifted < 0 or share < max(SURE, unshifted + ALIKE):
+    if ambiguous or abs(shift) <= LEAST_SHIFT or unshifted < 0 or share < max(LEAST_SHARE_EXPLAINED, unshifted + ALIKE):
         return None
     return CheckFinding('on_table', REFUSE, 'both streams must share one clock, '
                         f'the joints explain {100 * unshifted:.0f} % of the rates with a delay up to {LEAST_SHIFT} s '

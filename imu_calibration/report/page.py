@@ -63,7 +63,7 @@ USE = {'exact': 'removed by compensation', 'flagged': 'cannot be removed, sample
        'none': 'belongs to the table or the session, not removed'}
 
 COMMON = 'An error of the gravity used as reference scales all readings. The sds of the other parameters are given without it.'
-UNSEEN = 'fixed at its prior: its sd would exceed half of the prior sd'
+WEAK_DATA = 'fixed at its prior: its sd would exceed half of the prior sd'
 REPLACED = {
     REPLACEMENT: 'fixed at its prior: the estimate is weak and within one sd of it, so that the prior has the smaller expected error',
     LIKELIHOOD_RATIO: 'fixed at its prior, which is not significantly worse than the weak estimate (likelihood ratio)'}
@@ -114,5 +114,5 @@ def _why(calibration, index, share):
     if status == DETERMINED:
         return ''
     if status == HELD:
-        return REPLACED.get(calibration.held_reason.get(name), UNSEEN)
+        return REPLACED.get(calibration.held_reason.get(name), WEAK_DATA)
     return f'estimated, but its sd is {text(share, 2)} times the tolerance'

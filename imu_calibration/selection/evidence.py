@@ -10,7 +10,7 @@ from imu_calibration.core.distributions import chi2_sf, f_sf
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, solve_normal, solve_scaled
-from imu_calibration.estimation.solution import SURE
+from imu_calibration.estimation.solution import CONVENTION_SHARE
 from imu_calibration.selection.parameter_space import ParameterSpace, white_means, within_of_axis
 from imu_calibration.selection.reduced_recording import Recent
 
@@ -226,7 +226,7 @@ class WindowEvidence(Evidence):
         sd = np.sqrt(np.diag(covariance)[places])
         moved = slopes[:, list(used)] @ (covariance[:, places] / sd)
         sizes, directions = np.linalg.eigh(moved.T @ moved)
-        told = sizes > SURE * sizes[-1]   # without unobservable directions: compliances in no pose, arms that cancel
+        told = sizes > CONVENTION_SHARE * sizes[-1]   # without unobservable directions: compliances in no pose, arms that cancel
         n_windows, n_own = len(moved), int(told.sum())
         if n_windows - n_own < LEAST_SCATTER:
             return 0.0

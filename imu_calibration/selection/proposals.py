@@ -25,7 +25,7 @@ OTHER_SENSOR = 3.0
 """Standard deviations by which a cause of the table may differ from the estimate of the other sensor."""
 SHOWN_ALIKE = 3
 """Largest number of reported formulas of a class."""
-SEEN = 4.0
+CONCERNED_SDS = 4.0
 """Standard deviations from which an axis counts as concerned."""
 
 
@@ -167,7 +167,7 @@ def _told(blocks, attempt, fits, plain, choices):
     share = share_removed(plain, after)
     effects = tuple(_effect(blocks.sensor, number, text, formula, after.amplitudes[number], _taken(attempt))
                     for number, (_, text, formula) in enumerate(terms))
-    seen = np.abs(after.amplitudes) > SEEN * after.sd
+    seen = np.abs(after.amplitudes) > CONCERNED_SDS * after.sd
     rms = np.sqrt((columns**2).mean(axis=0))
     strong = (np.abs(after.amplitudes) * rms).sum(axis=0)
     axes = tuple(axis for k, axis in enumerate(AXES) if seen[:, k].any() and strong[k] > 0.1 * strong.max())

@@ -15,8 +15,8 @@ from imu_calibration.calibration.coverage import (
     ARMS_TIMES,
     ARROW,
     RADIUS,
-    SEEN,
     TINY,
+    VISITED,
     WHITE,
     Coverage,
     bars_of,
@@ -185,7 +185,7 @@ def scene_of(coverage: Coverage, frame_id: str) -> Any:
                                     head_length=0.2 * length, head_diameter=0.05, color=color(rgb))
 
     step, arms, center = coverage.next, np.zeros((0, 3)) if coverage.arms is None else coverage.arms, np.zeros(3)
-    balls = [ball(*cell) for cell in cells_of(coverage)] + [ball(1.1 * RADIUS * up, SEEN, TINY) for up in coverage.seen]
+    balls = [ball(*cell) for cell in cells_of(coverage)] + [ball(1.1 * RADIUS * up, VISITED, TINY) for up in coverage.seen]
     arrows = [arrow(center, ARMS_TIMES * arm, rgb) for arm, rgb in zip(arms, 0.9 * np.eye(3), strict=False) if arm.any()]
     if step.up is not None:
         arrows.append(arrow(center, 1.25 * RADIUS * step.up, ARROW))

@@ -41,8 +41,8 @@ NOISE = _of(
      'test_noise_model.py::test_a_variance_from_few_data_is_taken_larger'),
     ('slow misfit not weighed apart', 'band_misfit', 'APART', 'np.inf',
      'test_bands.py::test_a_wrong_gain_at_high_frequency_does_not_bend_the_estimate'),
-    ('caution about the slow misfit dropped', 'SURE', '2.0', '0.0', 'test_bands.py::test_the_slow_misfit_of_few_pieces_is_taken_larger'),
-    ('correlated misfit along the columns not seen', 'STRONG', '1e-06', '2.0',
+    ('caution about the slow misfit dropped', 'CAUTIOUS_SDS', '2.0', '0.0', 'test_bands.py::test_the_slow_misfit_of_few_pieces_is_taken_larger'),
+    ('correlated misfit along the columns not seen', 'DESIGN_EIGENVALUE_SHARE', '1e-06', '2.0',
      'test_noise_model.py::test_misfit_along_the_columns_shows_how_correlated_it_is'),
 )
 COVARIANCE = _of(
@@ -120,7 +120,7 @@ SEARCH = _of(
      'test_search.py::test_a_lag_that_would_be_negative_is_no_finding_and_asks_for_an_explanation'),
     ('lags that cost more than none explain', '_explanations', '[_1 for _1 in _2 if _1.cost < sum((_3.cost for _3, *_4 in _5.values()))]',
      '[_1 for _1 in _2]', 'test_lag_explanations.py::test_what_costs_more_than_no_lag_explains_nothing'),
-    ('what no window tells of an effect is divided by', 'WindowEvidence.p_value_by_scatter', 'SURE * _1[-1]', '-1.0',
+    ('what no window tells of an effect is divided by', 'WindowEvidence.p_value_by_scatter', 'CONVENTION_SHARE * _1[-1]', '-1.0',
      'test_search.py::test_windows_agree_on_what_they_tell_of_an_effect'),
     ('what replaces an effect may be chance', 'Search._replaced', 'self.score(_1, _2).significant', 'True',
      'test_search.py::test_what_replaces_an_effect_is_significant_itself'),

@@ -21,9 +21,9 @@ CONTRADICTED = 0.35
 """
 rad; a larger angle between rotated and observed gravity after a turn is no error of the rates: scale errors of a tenth cause less.
 """
-SEEN = 0.05
+LEAST_ERROR_SHARE = 0.05
 """A combination of a unit's rows that keeps less than this share of its error after the fit is not tested."""
-LOOSE = 1e3
+OUTLIER_SD_FACTOR = 1e3
 """Sd factor that excludes an outlying pose; its direction is still estimated from the turns."""
 
 
@@ -78,7 +78,7 @@ def _distance(rest, basis, least):
 
 
 def _p_value(rest, basis, total, spare):
-    square, count = _distance(rest, basis, SEEN)
+    square, count = _distance(rest, basis, LEAST_ERROR_SHARE)
     if not count or spare - count < LEAST_SPARE:
         return 1.0
     return chance_of_fall(square, count, rest=total - square, spare=spare - count)
@@ -86,5 +86,5 @@ def _p_value(rest, basis, total, spare):
 
 def _loosened(sem, index):
     loose = sem.copy()
-    loose[index] *= LOOSE
+    loose[index] *= OUTLIER_SD_FACTOR
     return loose
