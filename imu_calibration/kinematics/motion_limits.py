@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import DEG
-from imu_calibration.kinematics.joint import Joint
-from imu_calibration.kinematics.table import Table
+
+if TYPE_CHECKING:   # the help of verbs reads the layout of messages, hence this module; the table imports scipy
+    from imu_calibration.kinematics.joint import Joint
+    from imu_calibration.kinematics.table import Table
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg.blas import dtbsv
 
 CORNER = 5.0
 """
@@ -73,6 +72,8 @@ def autoregressive(drive: np.ndarray, decay: float, before: ArrayLike) -> np.nda
 
     A unit triangular system with one band below the diagonal, as the import of scipy.signal is slow.
     """
+    from scipy.linalg.blas import dtbsv
+
     drive, band = np.array(drive, float), np.tile([[1.0], [-decay]], (1, len(drive)))
     drive[:1] += decay * np.asarray(before)
     return np.stack([dtbsv(1, band, column, lower=1, diag=1) for column in drive.T], axis=1)
