@@ -59,12 +59,14 @@ NAMED = {'setting': 'the text has the names of parameters of the node', 'imu_top
 UNREACHABLE = {
     'calibration_node': {'nominal': 'readings are converted in the driver, which the error says', 'anyway': 'no calibration is applied',
                          'columns': 'no text log is read', 'force': 'results of verbs', 'up': 'of transforms in a bag', 'setting': NAMED['setting'],
-                         'calibration': 'no recording is replayed'},
+                         'calibration': 'no recording is replayed', 'jobs': 'one process reads', 'scheduler': 'one process reads',
+                         'target_frame': 'no calibration is applied'},
     'planner_node': {'anyway': 'no calibration is applied', **NAMED, 'nominal': 'no readings are compared', 'gravity': 'no calibration is estimated',
                      'calibration': 'with a plan for separation alone', 'diagnose': 'no calibration is estimated', 'inspect': 'no calibration is estimated',
-                     'temperature_topic': 'no recording is replayed', 'up': 'of transforms in a bag'},
+                     'temperature_topic': 'no recording is replayed', 'up': 'of transforms in a bag',
+                     'target_frame': 'no calibration is applied'},
     'simulator_node': {'temperature_topic': 'no recording is replayed', 'up': 'of transforms in a bag'},
-    'compensator_node': {'allow_xacro': 'no robot description is read', 'up': 'of transforms in a bag'},
+    'compensator_node': {'allow_xacro': 'no robot description is read', 'imu_link': 'no robot description is read', 'up': 'of transforms in a bag'},
     'bag_player_node': {'allow_xacro': 'no robot description is read'},
 }
 """Node -> {key of errors in the modules that it imports: reason why the node needs no name for it}."""

@@ -208,7 +208,7 @@ def test_two_imus_by_namespace_from_best_effort_publishers(station, session, tmp
 
 @pytest.mark.long
 def test_two_thousand_imu_and_a_thousand_joint_messages_per_second_are_held(station, tmp_path):
-    imu, joints, _, _ = make_session(3, 2000.0, 1000.0, seconds=16.0)
+    imu, joints, _, _ = make_session(3, 2000.0, 1000.0, seconds=29.0)
     write_session(tmp_path / 'fast', imu, joints)
     node = station.calibration_node(tmp_path)
     station.until(lambda: station.status, 'the node')
