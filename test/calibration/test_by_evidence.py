@@ -193,14 +193,15 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
     part = solution.model.slices[question.sensor, question.name]
     doubled = SimpleNamespace(model=SimpleNamespace(slices={(question.sensor, question.name): slice(0, 2)}), held=np.zeros(2, bool),
                               values=np.full(2, solution.values[part.start]), covariance=np.full((2, 2), 1e-12))
+    pair = SimpleNamespace(sensor=question.sensor, name=question.name, effect=replace(question.effect, components=('x', 'y')))
     monkeypatch.setattr(by_evidence, 'make_prior', lambda model: SimpleNamespace(mean=np.zeros(2)))
-    assert stands_out(doubled, question)   # a convention makes covariances of whole effects singular
+    assert stands_out(doubled, pair)   # a convention makes covariances of whole effects singular
     def of(distances, correlation, sd=1e-6):
         shape = np.full((2, 2), correlation) + (1 - correlation) * np.eye(2)
         return SimpleNamespace(model=doubled.model, held=doubled.held, values=sd * np.array(distances), covariance=sd**2 * shape)
-    assert stands_out(of([6.0, 1.0], 0.0), question)
-    assert not stands_out(of([2.5, -2.5], 0.9), question)   # significant together (chi2 125), but no coefficient is
-    assert not stands_out(of([6.0, 1.0], 0.0, sd=10 * question.effect.largest), question)   # a size of no instrument
+    assert stands_out(of([6.0, 1.0], 0.0), pair)
+    assert not stands_out(of([2.5, -2.5], 0.9), pair)   # significant together (chi2 125), but no coefficient is
+    assert not stands_out(of([6.0, 1.0], 0.0, sd=10 * question.effect.largest), pair)   # a size of no instrument
     monkeypatch.undo()
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
     faint = imu.calibrate(late[0].block, late[1]).calibration
