@@ -32,8 +32,9 @@ _SHOWN = {
             'm/s^3': (3600e6 / STANDARD_GRAVITY, 'µg/h'), 'rad/s/sqrt(Hz)': (60 / DEG, 'deg/√h'),
             'rad/s^2/sqrt(Hz)': (60 * 3600 / DEG, 'deg/h/√h'), 'rad/s': (3600 / DEG, 'deg/h'), 'rad': (3600 / DEG, 'arcsec'),
             'rad/s/K': (3600 / DEG, '(deg/h)/K'), 'rad/s^2': (3600 * 3600 / DEG, '(deg/h)/h'), 's': (1.0, 's')},
+    'time_constant': {'s': (1.0, 's')}, 'time': {'s': (1.0, 's')},
 }
-"""Quantity ('' for all) or sensor -> SI unit -> (factor, customary unit)."""
+"""Quantity ('' for all), component or sensor -> SI unit -> (factor, customary unit)."""
 
 
 OTHER_UNITS = {'g': 1 / STANDARD_GRAVITY, 'mg': 1e3 / STANDARD_GRAVITY}
@@ -57,7 +58,8 @@ def for_people(unit: str, quantity: str = '') -> tuple[float, str]:
         `NOISE`, or a parameter, whose name begins with its sensor: '(m/s^2)^-1' is mg/g² of an accelerometer and % per g of a gyroscope.
 
     """
-    return _SHOWN.get(quantity.partition('.')[0], {}).get(unit) or _SHOWN[''].get(unit, (1.0, unit))
+    kinds = (quantity.rpartition('.')[2], quantity.partition('.')[0], '')
+    return next((_SHOWN[kind][unit] for kind in kinds if unit in _SHOWN.get(kind, {})), (1.0, unit))
 
 
 def decimals(sd: float, digits: int = 2) -> int:

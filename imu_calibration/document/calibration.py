@@ -188,7 +188,7 @@ def parameter_rows(calibration: 'Calibration') -> Iterator[tuple[str, ...]]:
     for effect in calibration.model.effects:
         part = calibration.model.slices[effect.key]
         for k, index in enumerate(range(part.start, part.stop)):
-            factor, unit = for_people(effect.unit_of(k), effect.sensor)
+            factor, unit = for_people(effect.unit_of(k), calibration.param_names[index])
             value, sd = with_sd(calibration.values[index] * factor, calibration.own_sd[index] * factor)
             yield calibration.param_names[index], value, sd, unit, str(calibration.status[index])
     if common := calibration.common_scale:

@@ -98,7 +98,7 @@ def _with_size(calibration, name):
         return name
     part = calibration.model.slices[effect.key]
     best = part.start + int(np.argmax(np.abs(calibration.values[part]) / np.maximum(calibration.sd[part], 1e-300)))
-    factor, unit = for_people(effect.unit_of(best - part.start), effect.sensor)
+    factor, unit = for_people(effect.unit_of(best - part.start), calibration.param_names[best])
     return f'{name} ({significant(calibration.values[best] * factor)} ± {significant(calibration.sd[best] * factor, 2)} {unit})'
 
 

@@ -161,7 +161,7 @@ class _Spectra:
             axes.plot(tone.frequencies, tone.power, color=AFTER, lw=0.9)
             axes.axhline(CLEAR, color=GREY, lw=0.6)
             axes.axvline(tone.frequency, color=INK, lw=0.8, ls=':')
-            axes.set_yscale('log')
+            log_axis(axes.yaxis)
             axes.set_ylabel(f'{tone.sensor} {tone.axis}: power / around')
             axes.set_xlabel('frequency, Hz' if tone.joint is None else f'cycles per turn of {tone.joint}')
 

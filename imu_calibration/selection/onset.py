@@ -19,6 +19,8 @@ MARGIN = LEAST_WINDOWS + 1
 """Least number of moving windows before and after an onset: the longer part, without the window of the onset, can be searched."""
 SUDDEN = 0.5
 """Largest share of the excess of a linear change in time that an onset may have: above it the change may be gradual."""
+LIKELY = 16.0
+"""A moment between two windows is refined if its loss is at most the least one and this (a likelihood ratio of 3e-4)."""
 SIMPLER = 1.25
 """A group of fewer parameters is preferred if its excess is at most this many times the least one."""
 
@@ -29,6 +31,8 @@ class Onset:
 
     time: float
     """Moment of the change, s since the first sample."""
+    time_sd: float
+    """Its standard deviation, s."""
     what: str
     """Name of the effect of the reference, or the sensors whose matrices change."""
     before: dict[str, float]
@@ -44,7 +48,7 @@ class Onset:
 
     def to_mapping(self) -> dict:
         """Return the onset as plain data."""
-        return {'time': self.time, 'what': self.what, 'share': self.share,
+        return {'time': self.time, 'time_sd': self.time_sd, 'what': self.what, 'share': self.share,
                 'parameters': {name: {'before': value, 'after': self.after[name], 'sd': self.sd[name], 'unit': self.units[name]}
                                for name, value in self.before.items()}}
 
@@ -76,22 +80,23 @@ def find_onset(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Q
         at = np.flatnonzero(np.isin(every, group))
         own = np.union1d(base, at)
         fits = [_fit(total, own, small, (matrix, matrix, at)) for matrix in after]
-        best = int(np.argmin([loss for loss, *_ in fits]))
+        losses = np.array([loss for loss, *_ in fits])
+        best, likely = int(np.argmin(losses)), allowed[losses < losses.min() + LIKELY]
         excess, gradual = fits[best][0] - count, _fit(total, own, small, (slope, curve, at))[0] - count
         if excess < (1 - LEAST_SHARE) * single and excess < SUDDEN * gradual:
-            found.append((len(group), excess, name, allowed[best], group, every[own], fits[best][1:]))
+            found.append((len(group), excess, name, likely[[0, -1]] + (0, 1), group, every[own], fits[best][1:]))
     if not found:
         return None
     most = SIMPLER * max(min(excess for _, excess, *_ in found), noise)
-    _, excess, name, last, group, own, (values, change, sd) = min(entry for entry in found if entry[1] <= most)
+    _, excess, name, ends, group, own, (values, change, sd) = min(entry for entry in found if entry[1] <= most)
     full, changed = np.zeros(attempt.space.size), np.zeros(attempt.space.size)
     full[own], changed[group] = values, change
     states = [attempt.absolute(full), attempt.absolute(full) + changed]
     model, names = attempt.recording.model, [attempt.space.names[k] for k in group]
     units = {label: effect.unit_of(k) for effect in model.effects for k, label in enumerate(effect.param_names())}
-    moment = _refined(windows, table, model, states=states, between=space.recording.time[[last, last + 1]])
+    moment, moment_sd = _refined(windows, table, model, states=states, between=space.recording.time[ends])
     before, after = (dict(zip(names, state[group].tolist())) for state in states)
-    return Onset(moment, name, before, after, dict(zip(names, sd.tolist())), {label: units[label] for label in names},
+    return Onset(moment, moment_sd, name, before, after, dict(zip(names, sd.tolist())), {label: units[label] for label in names},
                  1 - max(excess, 0.0) / single)
 
 
@@ -119,10 +124,17 @@ def _fit(total, own, small, changed=None):
 
 
 def _refined(windows, table, model, *, states, between):
-    """Return the moment between two times at which the sum of squares of the residuals of both states is least."""
+    """
+    Return (mean, standard deviation) of the posterior of the moment between two times, s.
+
+    With a flat prior, ``p(t) ~ exp(-S(t) / 2)``, S the sum of squares of the residuals of the first state before t and the second after it.
+    """
     near = [w for w in windows if w.time[-1] >= between[0] and w.time[0] <= between[1]]
     noise = np.median([w.noise_sd for w in near], axis=0)
     found = [residuals(near, table, model, values=state[:len(model.param_names)]) for state in states]
     squares = [sum(((rest[sensor] / sd)**2).sum(axis=1) for sensor, sd in zip(SENSORS, noise)) for rest in found]
-    time, cost = np.concatenate([w.time for w in near]), np.append(0.0, np.cumsum(squares[0] - squares[1]))
-    return float(time[min(int(np.argmin(cost)), len(time) - 1)])
+    time, cost = np.concatenate([w.time for w in near]), np.cumsum(squares[0] - squares[1])[:-1]
+    gap, weight = np.diff(time), np.exp((cost.min() - cost) / 2) * np.diff(time)
+    middle = time[:-1] + gap / 2
+    mean = weight @ middle / weight.sum()
+    return float(mean), float(np.sqrt(weight @ ((middle - mean)**2 + gap**2 / 12) / weight.sum()))

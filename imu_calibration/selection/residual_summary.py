@@ -11,7 +11,7 @@ from imu_calibration.selection.unexplained import Unexplained
 
 def look_beyond(found: Examination) -> dict[str, Unexplained]:
     """Return sensor -> the unexplained excess with its tones, and with regimes and a proposal where it is significant."""
-    tones = find_tones(found, found.table)
+    tones = find_tones(found, found.table, [proposal for sensor in found.rests if (proposal := found.proposal(sensor)) is not None])
     looked = {sensor: replace(rest, tones=tones[sensor]) for sensor, rest in found.rests.items()}
     for sensor, rest in looked.items():
         proposal = found.proposal(sensor)

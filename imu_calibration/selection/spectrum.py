@@ -12,6 +12,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.orders import FEWEST_SAMPLES, MOST, OUT, long_enough, orders_of
+from imu_calibration.selection.proposals import Proposal
 from imu_calibration.selection.residual_blocks import residuals
 
 STEP = 0.1
@@ -73,9 +74,9 @@ class Tone:
                 'share': self.share, 'text': self.text}
 
 
-def find_tones(found: Investigation, table: Table) -> dict[str, tuple[Tone, ...]]:
+def find_tones(found: Investigation, table: Table, formulas: Sequence[Proposal] = ()) -> dict[str, tuple[Tone, ...]]:
     """
-    Return sensor -> the tones in the residual of the findings, the most significant first.
+    Return sensor -> the tones in the residual of the findings and of some formulas, the most significant first.
 
     The residual of every stretch of at most ten seconds, or of at most ten turns of a joint in steady rotation, is transformed to
     frequencies. A peak has four times the median power around it; a tone has peaks in most stretches, tested against noise
@@ -83,9 +84,14 @@ def find_tones(found: Investigation, table: Table) -> dict[str, tuple[Tone, ...]
     second. Where few stretches turn, integer orders are searched in all motions of the joint (`selection.orders`). Fixed frequencies are
     removed before multiples of a speed are searched.
     """
-    attempt = found.attempt
-    values = attempt.values(found.named)[:len(attempt.recording.model.param_names)]
-    left = residuals(found.used, table, attempt.recording.model, values=values)
+    model = found.attempt.recording.model
+    values = found.attempt.values(found.named)[:len(model.param_names)]
+    for effect, value in ((effect, value) for formula in formulas for effect, value in zip(formula.effects, formula.values)):
+        wider = replace(model, catalogue=model.catalogue.with_effects(effect)).with_effect(effect.sensor, effect.name)
+        extended = wider.start_from(model, values)
+        extended[wider.slices[effect.key]] = value
+        model, values = wider, extended
+    left = residuals(found.used, table, model, values=values)
     edges = np.cumsum([len(window) for window in found.used])[:-1]
     tones = {}
     for sensor in SENSORS:

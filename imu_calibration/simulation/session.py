@@ -91,8 +91,8 @@ def random_values(model: SensorModel, grade: str = 'industrial', seed: int = 0) 
     return values
 
 
-def hidden_effect(model: SensorModel, name: str, seed: int = 0, *, share: float = 0.3) -> tuple[str, np.ndarray]:
-    """Return (sensor, values) of an effect of a model's catalogue at a share of its plausible size, with random signs and spread."""
+def hidden_effect(model: SensorModel, name: str, seed: int = 0, *, share: float = 0.3, moment: float = 60.0) -> tuple[str, np.ndarray]:
+    """Return (sensor, values) of an effect of a model's catalogue at a share of its plausible size; a step occurs at `moment`, s."""
     sensor = model.catalogue.owner_of(name, model.joint_names)
     effect = model.catalogue.find(sensor, name, model.joint_names)
     if not effect.plausible:
@@ -104,7 +104,7 @@ def hidden_effect(model: SensorModel, name: str, seed: int = 0, *, share: float 
     if effect.nonnegative:
         values = np.abs(values)
     if effect.timed:
-        values[-1] = 0.8 * effect.prior_values()[-1]
+        values[-1] = moment if effect.located else 0.8 * effect.prior_values()[-1]
     return sensor, values
 
 

@@ -103,7 +103,7 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
     mover = given if motion.table is None else Table.from_mapping(motion.table)
     model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed, catalogue_of(catalogue))
     for name in effects:
-        model, values = _with_effect(model, values, name, *hidden_effect(model, name, seed, share=size))
+        model, values = _with_effect(model, values, name, *hidden_effect(model, name, seed, share=size, moment=0.6 * motion.duration))
     warm = temperature or any('temperature' in effect.needs for effect in model.effects if effect.name in effects)
     noise = replace(GRADES[grade].noise, encoder_resolution=math.radians(encoder_resolution_deg), stamp_jitter=stamp_jitter_us * 1e-6)
     frame_id = table.imu_link if isinstance(table, Arm) and table.imu_link else LIKELY_LINK

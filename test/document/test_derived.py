@@ -93,6 +93,7 @@ def test_numbers_have_the_digits_that_their_sd_supports():
     factor, unit = for_people('rad')
     assert (factor * np.pi / 180, unit) == (pytest.approx(60.0), 'arcmin')
     assert for_people('1') == (1.0, '1')
+    assert for_people('s') == (1e3, 'ms') and for_people('s', 'reference.clock_step.time') == (1.0, 's')
 
 
 def test_the_unit_of_a_parameter_depends_on_its_sensor():

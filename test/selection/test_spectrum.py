@@ -1,8 +1,12 @@
 """Tones in the rest: what they are fixed to, and what is none."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from imu_calibration.core.units import DEG
+from imu_calibration.effects.catalogue import term
 from imu_calibration.report.figures import draw_tones
 from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.spectrum import _without, find_tones, of_stretches
@@ -55,8 +59,13 @@ def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():
     assert (teeth.joint, teeth.axis) == ('outer', 'x') and teeth.frequency == pytest.approx(Machine.teeth, abs=0.2)
     assert 'outer' in teeth.text and 'gyroscope x' in teeth.text and teeth.to_mapping()['joint'] == 'outer'
 
+    mesh = term('mesh', sensor='gyroscope', column=f'sin({Machine.teeth} * angle_1)', unit='rad/s', tolerance=1e-5, text='Teeth of the gear.')
+    formula = SimpleNamespace(effects=[mesh], values=[np.array([0.2 * DEG, 0.0, 0.0])])
+    assert [tone.sensor for tones in find_tones(found, recording.table, [formula]).values() for tone in tones] == ['accelerometer']
+
     class Rest:
         tones = (teeth, hum)
-    assert 'of the gyroscope' in draw_tones('gyroscope', Rest)
+    drawn = draw_tones('gyroscope', Rest)
+    assert 'of the gyroscope' in drawn and 'mathdefault' not in drawn
     Rest.tones = ()
     assert draw_tones('gyroscope', Rest) == ''

@@ -166,6 +166,11 @@ def test_thermal_calibrations_take_one_temperature_or_many():
         session.truth.compensate(raw)
 
 
+def test_a_simulated_step_occurs_after_the_first_half_of_the_session():
+    session = imu.simulate('quick', effects=['clock_step'], seed=2)
+    assert session.truth.values[-1] == pytest.approx(0.6 * session.duration)
+
+
 def test_compensating_a_bag_in_memory_and_into_a_bag_is_the_same(found, samples, tmp_path):
     inside = imu.compensate(SESSION, found.calibration)
     memory = imu.compensate(samples.imu, found.calibration)
