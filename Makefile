@@ -121,7 +121,7 @@ $(STAMP)-validate: $(STAMP) constraints/validate.txt
 # The parameter files of the nodes from what the nodes declare, the tolerances from the catalogue of effects.
 config: $(STAMP)
 	@$(PY) -m imu_calibration.nodes.parameters
-	@$(PY) -m imu_calibration.effects.tolerance_file
+	@$(PY) -m tools.tolerance_file
 
 # Pages that are written from what runs: the targets of exports, the answers with their commands and pictures.
 answers: $(STAMP)

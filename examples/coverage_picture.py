@@ -11,8 +11,7 @@ from visualization_msgs.msg import Marker
 from imu_calibration.calibration.advice import foretold
 from imu_calibration.calibration.coverage import DIRECTIONS, Bar, Coverage, Step
 from imu_calibration.calibration.hand_step import HandStep
-from imu_calibration.calibration.next_pose import knowledge_of
-from imu_calibration.calibration.pose_scan import NOTHING
+from imu_calibration.calibration.pose_scan import NOTHING, knowledge_of
 from imu_calibration.nodes.calibration_status import markers_of
 from imu_calibration.references.gravity.hand_options import HandOptions
 

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from examples.processes import NodeProcesses  # noqa: E402
 from imu_calibration.compensation.health import StopDetector  # noqa: E402
 from imu_calibration.core.samples import ImuSamples  # noqa: E402
 from imu_calibration.document import files  # noqa: E402
@@ -28,7 +29,6 @@ from imu_calibration.kinematics.rotations import (
     Reference,  # noqa: E402
     align,  # noqa: E402
 )
-from imu_calibration.nodes.processes import NodeProcesses  # noqa: E402
 from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
 from msg_adapters.imu_stream import ImuStream  # noqa: E402
 from msg_adapters.write import write_session  # noqa: E402

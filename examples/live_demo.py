@@ -19,8 +19,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from examples.processes import NodeProcesses  # noqa: E402
 from imu_calibration.document import files  # noqa: E402
-from imu_calibration.nodes.processes import NodeProcesses  # noqa: E402
 
 G, DEG = 9.80665, np.pi / 180
 TABLE = ROOT / 'config' / 'table_simulated.yaml'

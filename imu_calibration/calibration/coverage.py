@@ -13,9 +13,9 @@ from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.observability import MOTIONS, TABLE_MOTIONS, added_information, rest_with_up
-from imu_calibration.estimation.prior import GAUGE_SD, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import DETERMINED, LACKING
+from imu_calibration.estimation.weighted_system import GAUGE_SD, make_prior
 
 
 class Progress(StrEnum):

@@ -10,15 +10,15 @@ import numpy as np
 import imu_calibration
 from imu_calibration.core.documents import finite
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.uncorrected import Uncorrected
+from imu_calibration.document.trust import Uncorrected
 from imu_calibration.document.verdict import judged
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.covariance_terms import GRAVITY, REJECTED, replace_weak, with_term
 from imu_calibration.estimation.observability import Motion, motions_about
-from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import Solution, reasons_held, statuses
+from imu_calibration.estimation.weighted_system import make_prior
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import CheckFinding

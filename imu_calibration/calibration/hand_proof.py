@@ -8,7 +8,7 @@ import numpy as np
 from imu_calibration.calibration.proof import compared
 from imu_calibration.compensation.compensate import compensate
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.uncorrected import LAST_SHARE, Uncorrected, uncorrected_in_time
+from imu_calibration.document.trust import LAST_SHARE, Uncorrected, uncorrected_in_time
 from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.estimation.scaled_solve import scaled_lstsq
 from imu_calibration.estimation.solution import HELD

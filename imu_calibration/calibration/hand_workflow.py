@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -9,13 +10,24 @@ import imu_calibration
 from imu_calibration.calibration.advice import missing_motion
 from imu_calibration.calibration.from_solution import conditions, preflight_statistics
 from imu_calibration.calibration.hand_by_evidence import EvidentHand, solve_by_evidence
-from imu_calibration.calibration.hand_proof import prove_by_hand, uncorrected_by_hand
-from imu_calibration.calibration.hand_result import HandResult
-from imu_calibration.core.errors import InputError
+from imu_calibration.calibration.hand_proof import (
+    PER_TURN,
+    TURNS_LEAST,
+    entry_of,
+    held_out_values,
+    prove_by_hand,
+    turn_error,
+    uncorrected_by_hand,
+)
+from imu_calibration.calibration.result import CalibrationResult, ErrorBudget, ReferenceErrors, WindowErrors
+from imu_calibration.calibration.table_calibration import CheckResult
+from imu_calibration.compensation.stream import compensate_readings
+from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, NominalScaling, SampleBlock, TemperatureSamples
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.verdict import judged
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, UNIT, Role
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.estimation.covariance_terms import GRAVITY
 from imu_calibration.estimation.solution import HELD, reasons_held, statuses
@@ -23,13 +35,79 @@ from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, Watcher
+from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.equations import TurnData
-from imu_calibration.references.gravity.hand_calibration import gather_by_hand, with_weak_replaced
+from imu_calibration.references.gravity.hand_calibration import HandCalibration, HandData, gather_by_hand, with_weak_replaced
 from imu_calibration.references.gravity.hand_options import hand_options
 from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.gathered import Gathered
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HandResult(CalibrationResult):
+    """A calibration by hand with the data for its report."""
+
+    hand: HandCalibration
+    """Parameters, poses, noise and residuals."""
+
+    observations: ClassVar[str] = 'poses'
+
+    @property
+    def reference(self) -> str:
+        """Gravity."""
+        return 'gravity, by hand'
+
+    @property
+    def gravity(self) -> float:
+        """The reference, m/s^2."""
+        return self.hand.gravity
+
+    @property
+    def period(self) -> float:
+        """Sampling period, s."""
+        return float(self.hand.statistics['period'])
+
+    @property
+    def singular_values(self) -> np.ndarray:
+        """Empty: the directions of the poses are estimated too."""
+        return np.zeros(0)
+
+    def first_rest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean specific force and rate of the first pose, each shape (3,)."""
+        return self.hand.poses.force[0], self.hand.poses.rate[0]
+
+    def window_errors(self) -> WindowErrors:
+        """Return the errors of the poses, after: held out; relative to gravity along its estimated direction, and to zero rate."""
+        hand, poses = self.hand, self.hand.poses
+        force, rate = poses.force, poses.rate
+        true, zero = hand.gravity * hand.state.up, np.zeros_like(rate)
+        corrected_force, corrected_rate = hand.compensate(force, rate, poses.time, temperature_c=poses.temperature_c)
+        for out, values in held_out_values(hand, hand.used_turns, hand_options(self.options).settings):
+            corrected = hand.model.compensate(values, force, rate, time=poses.time, temperature_c=poses.temperature_c)
+            corrected_force[out], corrected_rate[out] = (part[out] for part in corrected)
+        samples = max(int(poses.stop[-1]), 1)
+        time = (poses.start + poses.stop) / 2 * self.gathered.duration / max(samples - 1, 1)
+        scatter = [float(hand.statistics.get(f'{name}_scatter_sd', 0.0)) for name in ('pose', 'drift')]
+        return WindowErrors(time, np.full(len(force), WindowKind.STATIC), {'accelerometer': force, 'gyroscope': rate},
+                            {'accelerometer': true, 'gyroscope': zero}, {'accelerometer': force - true, 'gyroscope': rate},
+                            {'accelerometer': corrected_force - true, 'gyroscope': corrected_rate},
+                            {'accelerometer': np.hypot(poses.force_sem, scatter[0]), 'gyroscope': np.hypot(poses.rate_sem, scatter[1])})
+
+    def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
+        """Empty: by hand no windows are stored."""
+        return {}
+
+    def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
+        """Return noise and gravity, the only reference. The sds contain the uncertainty of a gravity that was not given."""
+        model, values, known = self.calibration.model, self.calibration.values, self.options.gravity is not None
+        relative = self.calibration.common_scale.get('sd', errors.gravity / self.gravity)
+        part, gravity, gravity_sd = model.part('accelerometer', Role.LINEAR), np.zeros(len(values)), relative * self.gravity
+        gravity[part] = np.abs(values[part]) * relative
+        return ErrorBudget(tuple(model.param_names), {'noise': self.calibration.own_sd, 'gravity': gravity},
+                           {'noise': 'noise, scatter of poses and turns, as this recording shows them',
+                            'gravity': f'gravity {"known" if known else "not given: the standard one is known"} to {gravity_sd:.2g} m/s²'})
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,3 +243,67 @@ def _statistics(hand, counts, n_samples):
                   for s in SENSORS}
     return {**per_sensor, 'windows': {'static': found.get('poses', 0), 'turns': found.get('turns', 0)}, 'samples_used': {'all': n_samples},
             'by_hand': found, 'dropped': {reason: int(count) for reason, count in sorted(counts.items())}}
+
+
+def check_by_hand(source: Callable, calibration: Calibration, options: CalibrationOptions = CalibrationOptions()) -> CheckResult:
+    """
+    Prove a calibration on a recording of its IMU held still in some attitudes, with turns between them.
+
+    The error of the accelerometer is the length of its mean reading in a pose less gravity; that of the gyroscope the angle between gravity
+    rotated by its rates and gravity in the pose at the end of a turn, and its mean reading at rest. Before: readings unchanged; after: as
+    corrected by compensation. Directions of gravity are those of the corrected accelerometer for both.
+
+    Parameters
+    ----------
+    source : callable
+        Returns an iterator of SampleBlock.
+    calibration : Calibration
+        From a table or by hand.
+    options : CalibrationOptions
+        The local gravity, if it differs from that of the calibration, and the conversion of volts or counts.
+
+    Raises
+    ------
+    InputError
+        When the recording cannot be used.
+
+    """
+    preflight = Preflight(options.gravity)
+    recording = read_by_hand(source(), options.nominal, [preflight])
+    try:
+        data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
+    except NotObservableError as error:
+        return CheckResult({}, preflight.findings, str(error))
+    check_force(float(np.median(np.linalg.norm(data.poses.force, axis=1))))
+    warm = None if recording.temperature_c is None else TemperatureSamples(recording.imu.stamp_ns, recording.temperature_c)
+    corrected = compensate_readings(calibration, recording.imu, temperature_c=warm)
+    return CheckResult(prove_readings(data, recording.imu, corrected, gravity=gravity_of(calibration, options)), preflight.findings)
+
+
+def gravity_of(calibration: Calibration, options: CalibrationOptions) -> float:
+    """Return the reference gravity for readings at rest, m/s^2: the given one, or that of the calibration."""
+    return options.gravity or calibration.conditions.get('gravity') or STANDARD_GRAVITY
+
+
+def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gravity: float) -> dict:
+    """Return the proof of corrected samples `after` against the raw ones: sensor -> entry of a document (see `calibration.proof`)."""
+    poses, turns = data.poses, [turn for turn in data.turns if turn.rotation is None]
+    ranges = [slice(start, stop) for start, stop in zip(poses.start, poses.stop, strict=True)]
+    (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))
+    rested = float(np.sum(poses.stop - poses.start) * poses.period)
+    lengths = (np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force))
+    norms, rest = (entry_of(errors, UNIT[sensor]) | {'seconds': rested} for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate))))
+    proof = {'accelerometer': norms | {'regimes': {'rest': norms}}, 'gyroscope': rest | {'regimes': {'rest': rest}}}
+    if len(turns) >= TURNS_LEAST:
+        up = force / np.linalg.norm(force, axis=1, keepdims=True)
+        # the first corrected readings are NaN where they need an angular acceleration
+        errors = (np.array([[turn_error(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up=up)]
+                            for turn in turns])
+                  for imu in (before, after))
+        angles = entry_of(errors, PER_TURN) | {'seconds': float(sum(turn.time[-1] - turn.time[0] for turn in turns))}
+        proof['gyroscope'] = angles | {'regimes': {'rest': rest, 'turns': angles}}
+    return proof
+
+
+def _means(imu, ranges):
+    return tuple(np.array([np.nanmean(values[part], axis=0) for part in ranges]) for values in (imu.force_s, imu.rate_s))

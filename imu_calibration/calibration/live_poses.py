@@ -8,10 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.calibration.coverage import Coverage, GroupState, group_states, waiting_groups
-from imu_calibration.calibration.hand_result import HandResult
-from imu_calibration.calibration.hand_workflow import HandRecording, calibrate_samples_by_hand
-from imu_calibration.calibration.next_pose import hand_coverage
-from imu_calibration.calibration.pose_scan import NOTHING, hand_status, look_for_poses
+from imu_calibration.calibration.hand_workflow import HandRecording, HandResult, calibrate_samples_by_hand
+from imu_calibration.calibration.pose_scan import NOTHING, hand_coverage, hand_status, look_for_poses
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SessionStatus, SolvePacer
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, SampleBlock

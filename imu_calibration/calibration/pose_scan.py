@@ -1,20 +1,26 @@
 """Progress of a calibration by hand: poses, attitudes and turns so far, and the missing direction or motion."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.calibration.coverage import Progress
+from imu_calibration.calibration.advice import HandKnowledge, foretold, knowledge_after, knowledge_at_first, ups_of
+from imu_calibration.calibration.coverage import DIRECTIONS, Coverage, Progress, Step
+from imu_calibration.calibration.hand_workflow import HandResult
 from imu_calibration.calibration.session import SessionStatus
 from imu_calibration.core.errors import with_hint
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.estimation.solution import COMMON_SCALE, LACKING
+from imu_calibration.effects.sensor_model import BASE, SensorModel
+from imu_calibration.estimation.solution import COMMON_SCALE, LACKING, tolerances_of
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.gravity.equations import Poses
 from imu_calibration.references.gravity.hand_calibration import POSES_FULL, POSES_LEAST
-from imu_calibration.references.gravity.hand_options import ByHandSettings
+from imu_calibration.references.gravity.hand_options import ByHandSettings, HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.poses import average_poses, distinct_attitudes
 from imu_calibration.references.gravity.turns import collect_turns
 
@@ -111,3 +117,24 @@ def _needs(found, not_seen, calibration, *, step, hints):
 
 def _plural(count, noun):
     return f'{count} {noun}' + ('' if count == 1 else 's')
+
+
+def knowledge_of(found: Findings, result: HandResult | None, options: HandOptions) -> HandKnowledge:
+    """Return the HandKnowledge of a session: before the first solution from its poses, then from the solution."""
+    if result is not None:
+        return knowledge_after(result.hand)
+    model = HandModel(SensorModel(options.accelerometer or BASE, options.gyroscope or BASE, catalogue=options.catalogue), options.gravity)
+    return knowledge_at_first(model, tolerances_of(model.model, options.tolerances), options.settings, poses=found.poses)
+
+
+def hand_coverage(found: Findings, result: HandResult | None, options: HandOptions, *, frame_id: str = '') -> Coverage:
+    """Return the Coverage of a session by hand: the cells, the next pose with the turn to it, and the remaining seconds."""
+    seen = ups_of(found.poses)
+    up = None if found.poses is None else seen[-1]
+    knowledge = knowledge_of(found, result, options)
+    steps = [] if result is not None and not set(LACKING) & set(result.hand.statuses) else foretold(knowledge)
+    if not steps:
+        return Coverage(np.zeros(len(DIRECTIONS)), seen, up, Step(''), 0.0, frame_id=frame_id)
+    first, worth = steps[0], knowledge.best()[1]
+    return Coverage(worth, seen, up, Step(first.words, first.up, first.axis, first.angle), sum(step.seconds for step in steps),
+                    frame_id=frame_id)

@@ -19,7 +19,7 @@ from imu_calibration.core.progress import report
 from imu_calibration.core.samples import TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import HELPS, decide, reason_of, worse_regimes
-from imu_calibration.document.uncorrected import LAST_SHARE, end_of, uncorrected_on_table
+from imu_calibration.document.trust import LAST_SHARE, end_of, uncorrected_on_table
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel

@@ -20,7 +20,7 @@ from imu_calibration.document import files
 from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.report.calibration_page import calibration_report
+from imu_calibration.report.calibration_sections import calibration_report
 from imu_calibration.report.page import render
 from imu_calibration.use_cases.choices import topics_of
 from imu_calibration.use_cases.provenance import provenance_with

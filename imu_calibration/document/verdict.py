@@ -33,7 +33,7 @@ from imu_calibration.document.decision import (
     reason_of,
     worse_regimes,
 )
-from imu_calibration.document.uncorrected import uncorrected_lines
+from imu_calibration.document.trust import uncorrected_lines
 from imu_calibration.effects.base import SECTIONS, SENSORS, UNIT, Role
 from imu_calibration.estimation.solution import COMMON_SCALE, DETERMINED, HELD, Status
 from imu_calibration.preprocessing.window import UnusedReason

@@ -10,8 +10,7 @@ from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.estimation.band_misfit import BandMisfit, band_misfit, misfit_along, own_misfit
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
 from imu_calibration.estimation.noise_search import estimate_offsets
-from imu_calibration.estimation.prior import fixed_parameters
-from imu_calibration.estimation.weighted_system import WeightedSystem
+from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters
 
 LEAST_INFLATION, LEAST_SHAKEN = 0.8, 0.01
 """Least noise at low frequency as a share of white noise of the same variance, at rest and under vibration."""

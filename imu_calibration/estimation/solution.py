@@ -11,7 +11,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.covariance_terms import Terms, of_fit, total
 from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.estimation.prior import make_prior
+from imu_calibration.estimation.weighted_system import make_prior
 
 
 class Status(StrEnum):

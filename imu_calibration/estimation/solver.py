@@ -13,11 +13,10 @@ from imu_calibration.estimation.accumulator import Accumulator, not_separable
 from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD, NOISE
 from imu_calibration.estimation.model_error import model_error
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
-from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, inverse_normal, scaled_lstsq
 from imu_calibration.estimation.session_noise import first_noise, updated_noise
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.weighted_system import WeightedSystem
+from imu_calibration.estimation.weighted_system import Prior, WeightedSystem, fixed_parameters, make_prior
 from imu_calibration.estimation.whitening import predict_session_offsets
 
 P_VALUE = 1e-3

@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -40,22 +40,21 @@ from imu_calibration.kinematics.motion_limits import (
 )
 from imu_calibration.nodes.calibration_status import driven_markers
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
-from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
+from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.inputs import BatchInput, MatchedInput, latched_qos, watch_inputs
 from imu_calibration.nodes.joint_commands import OtherDrivers, make_command
 from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node
 from imu_calibration.nodes.parameters import HINTS, declare_parameters
-from imu_calibration.nodes.planner_status import drive_statuses
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.planning.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect, separator_of
-from imu_calibration.planning.driver import Driver, DriverSettings
+from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
 from imu_calibration.planning.planner import make_planner
 from imu_calibration.planning.repertoire import up_at
 from imu_calibration.planning.situation import expected_noise, require_grade
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.use_cases.resources import config_file
+from imu_calibration.use_cases.choices import config_file
 from msg_adapters.joint_state import joint_row
 from msg_adapters.layout import UnusableMessage
 
@@ -360,3 +359,21 @@ def main(arguments: list[str] | None = None) -> int:
 
 if __name__ == '__main__':
     sys.exit(main())
+
+
+
+def drive_statuses(driver: Driver, worker: PlannerWorker, commands: str, *, faults: list[str]) -> list:
+    """Return the DiagnosticStatus of the drive; `commands`: topic or action of the trajectories, `faults`: lines about the inputs."""
+    name, excess = worker.worst
+    values = {'state': driver.state.value, 'motion': driver.motions, 'of it driven [s]': f'{driver.progress:.1f}',
+              'it takes [s]': f'{worker.seconds:.1f}', 'elapsed [s]': f'{worker.elapsed:.1f}', 'outside tolerance': worker.outside,
+              'furthest outside': name, 'standard deviation over tolerance': f'{excess:.2f}', 'commands': commands,
+              'ignored joint states': ' '.join(f'{name}:{count}' for name, count in driver.ignored.items())}
+    if worker.campaign is not None and worker.campaign.findings is not None:
+        values |= {'found': ' '.join(finding.effect for finding in worker.campaign.findings),
+                   'mates': ' '.join(mate for finding in worker.campaign.findings for mate in finding.mates),
+                   'separations': worker.campaign.separations, 'separating': worker.campaign.is_separating,
+                   'told apart': ' '.join(worker.campaign.told_apart)}
+    text = '; '.join([worker.doing or f'{driver.state}: {driver.reason}', *faults])
+    level = DiagnosticStatus.ERROR if driver.state == DriveState.STOPPED else WARN if faults else OK
+    return [make_status(level, 'drive', text, values=values)]

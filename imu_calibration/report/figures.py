@@ -4,6 +4,8 @@ import io
 import math
 import re
 from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from imu_calibration.calibration.installation_angles import PAIRS, derive, in_pa
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.compensation.compensate import arms_of
 from imu_calibration.core.units import DEG, decimals
+from imu_calibration.document import files
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.report.page import fixed, pair
 from imu_calibration.selection.spectrum import CLEAR
@@ -19,7 +22,7 @@ from imu_calibration.selection.unexplained import Unexplained
 
 
 class Drawn(str):
-    """SVG of a matplotlib figure; templates do not escape it."""
+    """SVG of a matplotlib figure: templates do not escape it, a notebook shows it, a file can contain it."""
 
     figure: Any
     """The matplotlib figure."""
@@ -33,6 +36,21 @@ class Drawn(str):
     def __html__(self) -> str:
         return str(self)
 
+    def _repr_html_(self) -> str:
+        return f'<div style="max-width:860px">{self}</div>'
+
+    @property
+    def axes(self) -> list[Any]:
+        """The matplotlib axes; ``axes[0].figure`` is the figure."""
+        return self.figure.axes
+
+    def save(self, path: str | PathLike) -> None:
+        """Write the figure: as PDF if the name ends with .pdf, otherwise as SVG."""
+        if Path(path).suffix.lower() == '.pdf':
+            files.write_whole(path, self.pdf)
+        else:
+            files.write_text(path, str(self))
+
     @property
     def pdf(self) -> bytes:
         """The figure as PDF; the same input gives the same bytes."""
@@ -45,7 +63,7 @@ class Drawn(str):
     def data(self) -> list[dict[str, Any]]:
         """For each axes its title and labels, and 'lines': list of (label, x (n,), y (n,)) as arrays in the units of the labels."""
         return [{'title': axes.get_title(loc='left'), 'x': axes.get_xlabel(), 'y': axes.get_ylabel(),
-                 'lines': [(line.get_label(), *line.get_data()) for line in axes.get_lines()]} for axes in self.figure.axes]
+                 'lines': [(line.get_label(), *line.get_data()) for line in axes.get_lines()]} for axes in self.axes]
 
 
 INK, GREY, FAINT, GRID = '#1b2430', '#5c6877', '#98a2b0', '#e3e8ee'

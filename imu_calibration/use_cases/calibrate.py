@@ -20,8 +20,8 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.verdict import judged
+from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
-from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.provenance import provenance_with
 from imu_calibration.use_cases.recordings import jobs_for, name_of, open_bag, process_mapper, source_of
 from imu_calibration.use_cases.stand import Stand, table_of
@@ -49,16 +49,16 @@ class Calibrated:
         """0 when each sensor helps, every requested parameter is determined and no message was lost, otherwise 3."""
         return exit_code(self.calibration)
 
-    def plot(self, sensor: str = 'accelerometer') -> Drawing:
+    def plot(self, sensor: str = 'accelerometer') -> Drawn:
         """Return the errors of one sensor in every window, before and after, as a figure for a notebook."""
         from imu_calibration.report.residuals import draw_windows
-        return Drawing(draw_windows(self.result.window_errors(), sensor))
+        return draw_windows(self.result.window_errors(), sensor)
 
     @cached_property
     def report(self) -> str:
         """The report as one HTML page."""
         report('drawing the report')
-        from imu_calibration.report.calibration_page import calibration_report
+        from imu_calibration.report.calibration_sections import calibration_report
         return calibration_report(self.result)
 
     def save(self, folder: str | PathLike, *, report: bool = True) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Unpack
 
-from imu_calibration.calibration.hand_check import check_by_hand, gravity_of
+from imu_calibration.calibration.hand_workflow import check_by_hand, gravity_of
 from imu_calibration.calibration.table_calibration import CheckResult, check_on_table
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files

@@ -13,8 +13,8 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
-from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.provenance import provenance_with
 from imu_calibration.use_cases.recordings import source_of
 from imu_calibration.use_cases.stand import Stand, table_of
@@ -52,12 +52,12 @@ class Diagnosed:
         """0 when every requested parameter is determined and no message was lost, otherwise 3."""
         return exit_code(self.calibration)
 
-    def plot(self, number: int = 1) -> Drawing:
+    def plot(self, number: int = 1) -> Drawn:
         """Return the residual against the cause of a finding, before and after; 0, or without findings: residuals over time."""
         from imu_calibration.report.diagnosis_page import draw_finding, draw_over_time
         if not number or not self.findings:
-            return Drawing(draw_over_time(self.result))
-        return Drawing(draw_finding(self.result.diagnosis, self.findings[number - 1], number))
+            return draw_over_time(self.result)
+        return draw_finding(self.result.diagnosis, self.findings[number - 1], number)
 
     @cached_property
     def report(self) -> str:

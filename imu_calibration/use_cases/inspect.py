@@ -6,8 +6,7 @@ from os import PathLike
 
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.hand_by_evidence import EvidentHand
-from imu_calibration.calibration.hand_result import HandResult
-from imu_calibration.calibration.hand_workflow import hand_result, read_by_hand
+from imu_calibration.calibration.hand_workflow import HandResult, hand_result, read_by_hand
 from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import ImuCalibrationError

@@ -10,8 +10,8 @@ from imu_calibration.allan.identify import NoiseIdentification, figures_of, iden
 from imu_calibration.core.samples import NominalScaling, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.preprocessing.checks import warnings
+from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import nominal_of
-from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.recordings import Topics, provenance_of, source_of
 
 
@@ -36,10 +36,10 @@ class IdentifiedNoise:
         """Faults of the recording."""
         return tuple(finding.text for finding in warnings(self.result.record.survey.findings))
 
-    def plot(self, sensor: str = 'accelerometer') -> Drawing:
+    def plot(self, sensor: str = 'accelerometer') -> Drawn:
         """Return the Allan deviations of one sensor with their model as a figure for a notebook."""
         from imu_calibration.report.noise_page import draw_curve
-        return Drawing(draw_curve(self.result, sensor))
+        return draw_curve(self.result, sensor)
 
     @cached_property
     def report(self) -> str:

@@ -27,8 +27,8 @@ from imu_calibration.planning.hand_plan import HandPlan, hand_plan_to_mapping, p
 from imu_calibration.planning.planner import Plan, make_planner, plan_to_mapping, trajectory_to_mapping
 from imu_calibration.planning.situation import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import calibration_options
-from imu_calibration.use_cases.drawing import Drawing
 from imu_calibration.use_cases.stand import Stand, table_of
 
 LONGEST_SEPARATION = 180.0
@@ -76,10 +76,10 @@ class Planned:
         from imu_calibration.report.plan_page import plan_report
         return plan_report(self.plan, self.provenance)
 
-    def plot(self) -> Drawing:
+    def plot(self) -> Drawn:
         """Return the standard deviations against time, in tolerances, as a figure for a notebook."""
         from imu_calibration.report.plan_page import draw_progress
-        return Drawing(draw_progress(self.plan))
+        return draw_progress(self.plan)
 
     def save(self, folder: str | PathLike, *, report: bool = True, bag: bool = True, storage: str = 'sqlite3') -> None:
         """Write plan.yaml, trajectory.yaml and, when wanted, report.html and the bag `trajectory` with one message for each motion."""

@@ -26,9 +26,8 @@ from imu_calibration.calibration.coverage import (
     table_coverage,
 )
 from imu_calibration.calibration.diagnosis.traces import Traces
-from imu_calibration.calibration.hand_result import HandResult
-from imu_calibration.calibration.next_pose import hand_coverage
-from imu_calibration.calibration.pose_scan import NOTHING
+from imu_calibration.calibration.hand_workflow import HandResult
+from imu_calibration.calibration.pose_scan import NOTHING, hand_coverage
 from imu_calibration.calibration.result import CalibrationResult, exit_code
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import InputError
@@ -94,7 +93,7 @@ def residual(result: CalibrationResult) -> dict[str, Any]:
 
 def spectrum(result: CalibrationResult, windows: Sequence[Window]) -> dict[str, Any]:
     """Return the amplitude density of the residuals within windows with motion; no lines where none is long enough."""
-    from imu_calibration.calibration.residual_spectrum import residual_spectrum
+    from imu_calibration.calibration.table_result import residual_spectrum
     frequency, density = residual_spectrum(result, windows)
     return {'lines': [{'frequency': float(f), **_by_sensor(density, k)} for k, f in enumerate(frequency)]}
 

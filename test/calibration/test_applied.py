@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.hand_check import prove_readings
-from imu_calibration.calibration.hand_workflow import read_by_hand
+from imu_calibration.calibration.hand_workflow import prove_readings, read_by_hand
 from imu_calibration.calibration.proof import nominal_values
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import DEG
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
-from imu_calibration.document.trust import caveats
-from imu_calibration.document.uncorrected import END, MEAN
+from imu_calibration.document.trust import END, MEAN, caveats
 from imu_calibration.effects.catalogue import CATALOGUE, term
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
 from imu_calibration.use_cases.recordings import Topics, source_of

@@ -9,7 +9,7 @@ import pytest
 
 import imu_calibration as imu
 from imu_calibration.calibration import by_evidence
-from imu_calibration.calibration.by_evidence import _moves, stands_out
+from imu_calibration.calibration.by_evidence import _moves, extended_solution, stands_out
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.calibration.from_solution import Demand
@@ -17,7 +17,6 @@ from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable import gathered
-from imu_calibration.references.turntable.extended_model import extended_solution
 from imu_calibration.references.turntable.gathered import SpreadWindows
 from imu_calibration.report.diagnosis_page import diagnosis_report
 from imu_calibration.selection import investigation, questions

@@ -10,8 +10,7 @@ from imu_calibration.calibration.advice import WEIGHTS, _rollout, foretold
 from imu_calibration.calibration.coverage import DIRECTIONS, ENOUGH, Bar, Coverage, Step, line_of, table_coverage
 from imu_calibration.calibration.hand_step import HandStep, direction_words, shortest_turn
 from imu_calibration.calibration.live_poses import LiveByHand
-from imu_calibration.calibration.next_pose import hand_coverage, knowledge_of
-from imu_calibration.calibration.pose_scan import NOTHING
+from imu_calibration.calibration.pose_scan import NOTHING, hand_coverage, knowledge_of
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
@@ -147,7 +146,7 @@ def _sd_after(information, prior):
 def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
     """What they would add to the information is added, one after the other; the first is the next one."""
     from imu_calibration.estimation.observability import added_information
-    from imu_calibration.estimation.prior import make_prior
+    from imu_calibration.estimation.weighted_system import make_prior
     live, result = begun
     shown, solution = live.coverage(), result.solution
     assert result.needed and 0 < shown.seconds < 600 and shown.next.text in {motion.text for motion in MOTIONS}

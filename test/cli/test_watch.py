@@ -59,7 +59,7 @@ def test_before_anything_came_the_screen_is_short():
 @pytest.mark.live
 def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
     pytest.importorskip('rclpy')
-    from imu_calibration.nodes.processes import local_environment, node_command
+    from examples.processes import local_environment, node_command
 
     from ros.live_station import TABLE, free_domain
     domain_id, lock = free_domain()

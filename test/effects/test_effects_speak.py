@@ -25,8 +25,8 @@ from imu_calibration.effects.catalogue import CATALOGUE, Catalogue, from_definit
 from imu_calibration.effects.expressions import ColumnGroup
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.effects.tolerance_file import rendered
 from imu_calibration.kinematics.rotations import Reference
+from tools.tolerance_file import rendered
 
 ROOT = Path(__file__).resolve().parents[2]
 ALSO_WORDS = {'bias', 'matrix'}

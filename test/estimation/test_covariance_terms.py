@@ -87,8 +87,8 @@ def test_terms_and_reasons_pass_through_the_file(by_table):
 
 def test_offsets_of_windows_are_a_term_apart_from_white_noise(by_table):
     """Without bias processes, offsets and differences between recordings the second term vanishes."""
-    from imu_calibration.estimation.prior import make_prior
     from imu_calibration.estimation.solver import solve
+    from imu_calibration.estimation.weighted_system import make_prior
     solution, accumulator = by_table.solution, by_table.gathered.accumulator
     white = {sensor: replace(noise, offset_sd=0.0, bias_processes=()) for sensor, noise in solution.noise.items()}
     walking = {sensor: replace(noise, offset_sd=1e-2) for sensor, noise in white.items()}

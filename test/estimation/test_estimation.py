@@ -10,8 +10,8 @@ from imu_calibration.effects.forward_equations import References, coefficients, 
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import noise_model
 from imu_calibration.estimation.accumulator import Accumulator, restrict
-from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solver import solve
+from imu_calibration.estimation.weighted_system import make_prior
 from imu_calibration.estimation.window_statistics import reduce_window
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window

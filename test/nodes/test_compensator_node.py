@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from examples.processes import NodeProcesses
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.core.documents import version_of
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.nodes.message_compensation import LiveCompensation
-from imu_calibration.nodes.processes import NodeProcesses
 from msg_adapters.imu import FIELDS, parse_imu, patch_imu
 from msg_adapters.write import encode_imu
 

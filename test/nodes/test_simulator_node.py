@@ -21,7 +21,7 @@ from worlds.live_sessions import TABLE, make_session
 pytest.importorskip('rclpy')
 from refusal import refused
 
-from imu_calibration.nodes.processes import node_command  # noqa: E402
+from examples.processes import node_command  # noqa: E402
 
 from ros.live_station import Station, taken  # noqa: E402
 

@@ -22,7 +22,6 @@ from imu_calibration.selection.proposals import Proposal
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
-from imu_calibration.use_cases.drawing import Drawing
 
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
                                        {'name': 'inner', 'axis': [1, 0, 0]}],
@@ -67,11 +66,11 @@ def test_it_is_drawn_against_its_cause(result):
 
 
 def test_a_figure_is_svg_pdf_axes_and_arrays(result, tmp_path):
-    drawing = Drawing(draw_finding(result.diagnosis, result.diagnosis.findings[0], 1))
+    drawing = draw_finding(result.diagnosis, result.diagnosis.findings[0], 1)
     for name, head in (('p.pdf', b'%PDF-1.4'), ('p.svg', b'<svg ')):
         drawing.save(tmp_path / name)
         assert (tmp_path / name).read_bytes().startswith(head)
-    assert drawing.svg.pdf == drawing.svg.pdf
+    assert drawing.pdf == drawing.pdf
     left, right = drawing.data
     axis, _, values = cause_of(result.diagnosis, 'gyroscope', ('force',))
     np.testing.assert_array_equal(left['lines'][0][1], values)

@@ -4,7 +4,7 @@ import os
 import time
 from collections import defaultdict
 
-from imu_calibration.nodes.processes import local_environment
+from examples.processes import local_environment
 
 PATIENCE = 240.0
 """Seconds after which a wait fails; a busy machine needs some of them."""

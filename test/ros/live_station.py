@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imu_calibration.nodes.processes import NodeProcesses
+from examples.processes import NodeProcesses
 from msg_adapters.live import LiveGatherer
 
 ROOT = Path(__file__).resolve().parents[2]

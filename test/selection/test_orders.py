@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.selection.orders import MOST, OUT, orders_of
+from imu_calibration.selection.spectrum import MOST, OUT, orders_of
 
 TIME = 0.01 * np.arange(1200)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.coverage import line_of
-from imu_calibration.calibration.residual_spectrum import _power, residual_spectrum
+from imu_calibration.calibration.table_result import _power, residual_spectrum
 from imu_calibration.cli.main import main
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.calibration import UNKNOWN

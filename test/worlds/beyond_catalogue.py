@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from imu_calibration.calibration.by_evidence import extended_solution
 from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
 from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.references.turntable.extended_model import extended_solution
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.unexplained import biases_off
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from imu_calibration.calibration.by_evidence import extended_solution
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, parameters_of
 from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of_one_joint, sentence, separating_motion
 from imu_calibration.calibration.diagnosis.traces import residual_traces
@@ -13,12 +14,12 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.references.turntable.extended_model import extended_solution
 from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import Gain, gain_in_turn, heldout_gain
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.residual_analysis import Examination, inquire
-from imu_calibration.selection.residual_summary import look_beyond
+from imu_calibration.selection.spectrum import find_tones
+from imu_calibration.selection.unexplained import Unexplained
 
 MATE = 0.5
 """Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's reduction."""
@@ -130,3 +131,21 @@ def _clipping(limit, solution):
     gain = Gain(limit.sensor, 'clipped samples', limit.rms_before, limit.rms_after, (float('nan'), float('nan')), 0)
     return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, n_clipped=limit.n_clipped), parameters, limit.p_value,
                    limit.n_expected, 1.0, gain, (), '')
+
+
+def look_beyond(found: Examination) -> dict[str, Unexplained]:
+    """Return sensor -> the unexplained excess with its tones, and with regimes and a proposal where it is significant."""
+    tones = find_tones(found, found.table, [proposal for sensor in found.rests if (proposal := found.proposal(sensor)) is not None])
+    looked = {sensor: replace(rest, tones=tones[sensor]) for sensor, rest in found.rests.items()}
+    for sensor, rest in looked.items():
+        proposal = found.proposal(sensor)
+        regimes = found.regimes(sensor, formula=found.columns(sensor, proposal))
+        first = {regime.axis: regime for regime in reversed(regimes)}
+        if rest.significant or proposal is not None or first:
+            axes = rest.axes or (found.fits(sensor).axes() if proposal is not None else tuple(first))
+            looked[sensor] = replace(rest, regimes=tuple(first[axis] for axis in axes if axis in first), proposal=proposal,
+                                     axes=axes if proposal is None else proposal.axes)
+        if (proposal is not None or first) and not rest.significant:
+            sizes = proposal.sizes if proposal is not None else [regime.size * np.sqrt(regime.inside.mean()) for regime in first.values()]
+            looked[sensor] = replace(looked[sensor], significant=True, rms=float(np.hypot.reduce(sizes)))
+    return looked

@@ -20,8 +20,7 @@ from imu_calibration.references.gravity.equations import COMPONENTS, Poses, Stat
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_options import ByHandSettings, HandOptions, KnownTurn
 from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandModel
-from imu_calibration.references.gravity.pose_outliers import possible_turns, without_outliers
-from imu_calibration.references.gravity.pose_solver import first_state, solve_joint
+from imu_calibration.references.gravity.pose_solver import first_state, possible_turns, solve_joint, without_outliers
 from imu_calibration.references.gravity.poses import average_poses, distinct_attitudes, noise_statistics
 from imu_calibration.references.gravity.turns import collect_turns, full_scale_factor, known_turn_data, sample_times
 from imu_calibration.selection.questions import at_time_constants

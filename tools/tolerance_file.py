@@ -32,7 +32,7 @@ def _number(value):
     return f'{mantissa}0e{int(exponent)}' if mantissa.endswith('.') else f'{mantissa}e{int(exponent)}'
 
 
-def main(folder: Path = Path(__file__).resolve().parents[2] / 'config') -> None:
+def main(folder: Path = Path(__file__).resolve().parents[1] / 'config') -> None:
     """Write the file, and report whether it has changed."""
     path = folder / 'tolerances.yaml'
     if not path.exists() or path.read_text() != rendered():
