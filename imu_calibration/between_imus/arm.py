@@ -8,7 +8,6 @@ import scipy.linalg
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.between_imus.pair import (
-    ArmSettings,
     PairedImu,
     make_windows,
     relative_rotation,
@@ -18,13 +17,15 @@ from imu_calibration.between_imus.pair import (
 )
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.effects.sensor_model import linear_names
 from imu_calibration.kinematics.rotations import skew
-from imu_calibration.references.gravity.hand_calibration import HandCalibration
 
 TAIL_DOF = 3
 """Degrees of freedom of Student's t of the residuals: knocks cause long tails."""
+MOTION_SHARE = 0.05
+"""Windows with less lever-arm acceleration than this share of the strongest are left out: the noise estimate is that of motion."""
+CLUSTER = 2.0
+"""Errors are independent between segments of this length, s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,23 +233,18 @@ class RelativeArm:
                 yield f'the arm along {axis} is weak; twist fast about the other two axes'
 
 
-def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples, settings: ArmSettings = ArmSettings(), *, gravity: float = STANDARD_GRAVITY,
-                 calibration_a: HandCalibration | None = None, calibration_b: HandCalibration | None = None) -> RelativeArm:
+def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples) -> RelativeArm:
     """
     Estimate the arm r of ``f_B - f_A = alpha x r + omega x (omega x r)`` between two IMUs on one rigid body.
 
     Both sides are integrated over short windows with the same smooth weight; alpha enters as minus the integral of the
     weight's derivative times the rate, so no signal is differentiated. Windows with clipped samples are excluded. Biases,
-    scales and axes come from a calibration by hand of each IMU, made from the poses in the same recording when not given.
+    scales and axes come from a calibration by hand of each IMU, from the poses in the same recording.
 
     Parameters
     ----------
     imu_a, imu_b : ImuSamples
         Cleaned samples of the same recording, SI.
-    settings : ArmSettings
-    gravity : float
-        m/s^2.
-    calibration_a, calibration_b : HandCalibration, optional
 
     Returns
     -------
@@ -264,22 +260,21 @@ def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples, settings: ArmSettings = A
     """
     require_overlap(imu_a, imu_b)
     start = int(imu_a.stamp_ns[0])
-    a, b = (PairedImu.make(imu, start, gravity, calibration=given, settings=settings)
-            for imu, given in ((imu_a, calibration_a), (imu_b, calibration_b)))
-    rotation = relative_rotation(a, b, settings)
+    a, b = (PairedImu.make(imu, start) for imu in (imu_a, imu_b))
+    rotation = relative_rotation(a, b)
     delay = 0.0
     for _ in range(DELAY_ROUNDS):
-        rows = _build_rows(a, b, rotation, delay, settings)
+        rows = _build_rows(a, b, rotation, delay)
         fit = fit_arm(rows)
         delay += fit.values[-1]
         if abs(fit.values[-1]) < 1e-5:
             break
-    return _result(rows, fit, delay, rotation, (a, b), settings)
+    return _result(rows, fit, delay, rotation, (a, b))
 
 
-def _build_rows(a, b, rotation, delay, settings):
+def _build_rows(a, b, rotation, delay):
     """Integrate both sides over windows without clipping, the rates `delay` seconds later on their clocks."""
-    length, offset = window_length(a, b, settings), rotation.offset
+    length, offset = window_length(a, b), rotation.offset
     centres = window_centres(a, b, offset=offset, length=length)
     force_a, force_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
     rate_a, rate_b = make_windows(a.time, centres + delay, length), make_windows(b.time, centres + offset + delay, length)
@@ -288,7 +283,7 @@ def _build_rows(a, b, rotation, delay, settings):
     alpha_a, alpha_b = rate_a.slope(a.rate), rate_b.slope(in_a)
     products = 0.5 * (_products(rate_a.mean, a.rate) + _products(rate_b.mean, in_a))
     strength = np.sqrt(0.25 * np.sum((alpha_a + alpha_b)**2, axis=1) + np.trace(products, axis1=1, axis2=2)**2)
-    moving = strength > settings.motion_share * np.quantile(strength, 0.99)
+    moving = strength > MOTION_SHARE * np.quantile(strength, 0.99)
     keep = free & moving
     if keep.sum() < WINDOWS_LEAST:
         raise NotObservableError(f'the arm needs {WINDOWS_LEAST} windows of fast twisting without clipping, got {keep.sum()}; '
@@ -335,8 +330,8 @@ def _matrix_covariance(calibration):
     return calibration.covariance[np.ix_(index, index)]
 
 
-def _result(rows, fit, delay, rotation, streams, settings):
-    motion = jackknife_covariance(fit, rows.centres, settings.cluster)[:3, :3]
+def _result(rows, fit, delay, rotation, streams):
+    motion = jackknife_covariance(fit, rows.centres, CLUSTER)[:3, :3]
     calibration, turned = _calibration_covariance(fit, rows, *streams), _rotation_covariance(fit, rows, rotation)
     total = motion + calibration + turned
     sd = np.sqrt(np.diag(total))

@@ -6,10 +6,8 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.core.settings import setting
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.preprocessing.rest_detection import find_still
-from imu_calibration.references.gravity.equations import Poses
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, calibrate_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions
 
@@ -17,7 +15,15 @@ POWER = 6
 """The weight is sin^6: with eight samples per window its sums equal its integrals, and its ends are smooth to fifth order."""
 SAMPLES_LEAST = 8
 """Samples per window; with fewer the sums depend on the positions of the samples."""
-
+WINDOW = 0.12
+"""
+Length of the windows over which the motion is integrated, s; never below `SAMPLES_LEAST`. In shorter ones the noise of the angular
+acceleration shortens the arm, in longer ones fast motion averages out.
+"""
+GAP = 0.1
+"""Windows do not bridge longer holes, s; never below five periods."""
+OFFSET_ROUNDS = 4
+"""Repeated estimates of the delay between the stamps of the two IMUs."""
 BLOCK = 4_000_000
 """Numbers per gather operation."""
 
@@ -96,19 +102,6 @@ def holes(time: np.ndarray, longest: float) -> np.ndarray:
     return np.concatenate([wide, [False]]) | np.concatenate([[False], wide])
 
 
-@dataclass(frozen=True)
-class ArmSettings:
-    """Numbers for the estimate of a relative arm."""
-
-    window: float = setting(0.12, 's', 'length of the windows over which the motion is integrated; never below eight samples', (0.004, 5.0),
-                            'too short: noise of the angular acceleration shortens the arm; too long: fast motion averages out')
-    motion_share: float = setting(0.05, '1', 'windows with less lever-arm acceleration than this share of the strongest are left out',
-                                  (0.0, 0.9), 'too small: resting windows rule the noise estimate')
-    cluster: float = setting(2.0, 's', 'errors are independent between segments of this length', (0.1, 100.0),
-                             'too small: sd too small')
-    gap: float = setting(0.1, 's', 'windows do not bridge longer holes; never below five periods', (0.001, 60.0), '')
-
-
 @dataclass(frozen=True, eq=False)
 class PairedImu:
     """One IMU of the pair, compensated."""
@@ -122,26 +115,26 @@ class PairedImu:
     flagged: np.ndarray
     """Samples at the end of the range or next to a hole, shape (n,)."""
     calibration: HandCalibration | None
-    """Calibration applied; None: only the rates' bias at rest was removed."""
-    poses: Poses | None
-    """Poses of a calibration from the same recording."""
+    """Calibration by hand from the same samples; None: only the rates' bias at rest was removed."""
     period: float
     """Median step, s."""
 
     @classmethod
-    def make(cls, imu: ImuSamples, start_ns: int, gravity: float, *, calibration: HandCalibration | None,
-             settings: ArmSettings) -> 'PairedImu':
-        """Compensate the samples of one IMU, with a calibration from their own poses when none is given."""
+    def make(cls, imu: ImuSamples, start_ns: int) -> 'PairedImu':
+        """Compensate the samples of one IMU with a calibration from their own poses."""
         time = 1e-9 * (imu.stamp_ns - start_ns)
         keep = np.concatenate([[True], np.diff(time) > 0])  # repeated stamps add no new time
         imu, time = imu.select(keep), time[keep]
         period = float(np.median(np.diff(time)))
-        made_here = calibration is None
-        calibration = _calibrate(imu, gravity) if made_here else calibration
-        flagged = clipped(imu.force_s) | clipped(imu.rate_s) | holes(time, max(settings.gap, 5 * period))
-        poses = calibration.poses if made_here and calibration is not None else None
-        force, rate = _compensated(imu, calibration)
-        return cls(time, force, rate, flagged, calibration, poses, period)
+        flagged = clipped(imu.force_s) | clipped(imu.rate_s) | holes(time, max(GAP, 5 * period))
+        still = find_still(imu)
+        try:
+            calibration = calibrate_by_hand(imu, HandOptions(), still)
+            force, rate = calibration.compensate(imu.force_s, imu.rate_s)
+        except NotObservableError:
+            bias = np.mean([imu.rate_s[s].mean(0) for s in still], axis=0) if still else np.zeros(3)
+            calibration, force, rate = None, imu.force_s, imu.rate_s - bias
+        return cls(time, force, rate, flagged, calibration, period)
 
 
 def clipped(values: np.ndarray) -> np.ndarray:
@@ -159,21 +152,6 @@ def clipped(values: np.ndarray) -> np.ndarray:
     return flagged
 
 
-def _calibrate(imu, gravity):
-    try:
-        return calibrate_by_hand(imu, HandOptions(gravity), find_still(imu))
-    except NotObservableError:
-        return None
-
-
-def _compensated(imu, calibration):
-    if calibration is not None:
-        return calibration.compensate(imu.force_s, imu.rate_s)
-    still = find_still(imu)
-    bias = np.mean([imu.rate_s[s].mean(0) for s in still], axis=0) if still else np.zeros(3)
-    return imu.force_s, imu.rate_s - bias
-
-
 def require_overlap(imu_a: ImuSamples, imu_b: ImuSamples) -> None:
     """Refuse IMUs that were not recorded at the same time."""
     if len(imu_a) < 2 * SAMPLES_LEAST or len(imu_b) < 2 * SAMPLES_LEAST:
@@ -185,9 +163,9 @@ def require_overlap(imu_a: ImuSamples, imu_b: ImuSamples) -> None:
                          'check the clocks', code='no_overlap')
 
 
-def window_length(a: PairedImu, b: PairedImu, settings: ArmSettings) -> float:
+def window_length(a: PairedImu, b: PairedImu) -> float:
     """Return the length of the windows, s."""
-    return max(settings.window, SAMPLES_LEAST * max(a.period, b.period))
+    return max(WINDOW, SAMPLES_LEAST * max(a.period, b.period))
 
 
 def window_centres(a: PairedImu, b: PairedImu, *, offset: float, length: float) -> np.ndarray:
@@ -213,10 +191,10 @@ class RelativeRotation:
     """Delay of B's stamps, s."""
 
 
-def relative_rotation(a: PairedImu, b: PairedImu, settings: ArmSettings, *, rounds: int = 4) -> RelativeRotation:
+def relative_rotation(a: PairedImu, b: PairedImu) -> RelativeRotation:
     """Return the rotation from the directions at rest if both were calibrated, otherwise from the rates; the offset from the rates."""
-    offset, length = 0.0, window_length(a, b, settings)
-    for _ in range(rounds):
+    offset, length = 0.0, window_length(a, b)
+    for _ in range(OFFSET_ROUNDS):
         centres = window_centres(a, b, offset=offset, length=length)
         over_a, over_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
         free = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
@@ -241,10 +219,10 @@ def _align(vectors_a, vectors_b):
 
 def _directions_at_rest(a, b, offset):
     """Return mean forces of both over the times when both rest, or None when there are too few directions."""
-    if a.poses is None or b.calibration is None:
+    if a.calibration is None or b.calibration is None:
         return None
     pairs = []
-    for first, last in zip(a.poses.start, a.poses.stop):
+    for first, last in zip(a.calibration.poses.start, a.calibration.poses.stop):
         begin, end = a.time[first], a.time[last - 1]
         in_b = slice(*np.searchsorted(b.time, (begin + offset, end + offset)))
         if in_b.stop - in_b.start >= 2:

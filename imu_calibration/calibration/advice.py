@@ -15,9 +15,8 @@ from imu_calibration.calibration.coverage import DIRECTIONS, excess, share_gaine
 from imu_calibration.calibration.hand_step import TURNED, HandStep, steps_from, turn_rows
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import LACKING
-from imu_calibration.references.gravity.equations import Poses
+from imu_calibration.references.gravity.equations import SCATTER_SD, Poses
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
-from imu_calibration.references.gravity.hand_options import ByHandSettings
 from imu_calibration.references.gravity.hand_parameters import HandModel
 
 TREMBLING, CREEPING = 1.5e-3, 5e-4
@@ -151,24 +150,23 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     return tuple(found)
 
 
-def knowledge_at_first(model: HandModel, tolerances: np.ndarray, settings: ByHandSettings, *,
+def knowledge_at_first(model: HandModel, tolerances: np.ndarray, *,
                        noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
                        poses: Poses | None = None) -> HandKnowledge:
     """
-    Return the HandKnowledge before the first solution: from the poses only, at nominal values and with the scatter of the settings.
+    Return the HandKnowledge before the first solution: from the poses only, at nominal values and with the default scatter.
 
     Parameters
     ----------
     model : HandModel
     tolerances : ndarray, shape (n,)
-    settings : ByHandSettings
     noise : tuple
         Contribution of the sensor noise to a pose (m/s^2), to its mean rate (rad/s) and to a turn (rad).
     poses : Poses, optional
         Poses so far.
 
     """
-    scatter = (np.hypot(settings.pose_scatter, TREMBLING), np.hypot(settings.drift_scatter, CREEPING), settings.turn_scatter)
+    scatter = np.hypot(SCATTER_SD, (TREMBLING, CREEPING, 0.0))
     pose_sd, drift_sd, turn_sd = (float(np.hypot(*pair)) for pair in zip(scatter, noise, strict=True))
     knowledge = HandKnowledge(model, model.nominal, np.zeros((model.size, model.size)), MARGIN * tolerances, pose_sd, drift_sd, turn_sd,
                               None)

@@ -95,7 +95,7 @@ def extended_by_hand(data: HandData, found: 'HandInvestigation', options: HandOp
 
 def _asked(data, options):
     return {'accelerometer': options.accelerometer or BASE,
-            'gyroscope': options.gyroscope or default_gyroscope(data.poses, options.settings)[0]}
+            'gyroscope': options.gyroscope or default_gyroscope(data.poses)[0]}
 
 
 def _joined(asked, found):

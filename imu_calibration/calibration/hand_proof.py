@@ -15,7 +15,6 @@ from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, TurnData, between_middles
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
-from imu_calibration.references.gravity.hand_options import ByHandSettings
 from imu_calibration.references.gravity.poses import distinct_attitudes
 
 FOLDS = 8
@@ -30,7 +29,7 @@ PER_TURN = 'rad per turn'
 """Unit of the angle between rotated and observed gravity."""
 
 
-def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: ByHandSettings) -> dict:
+def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
     """
     Return the proof of a calibration by hand: sensor -> entry of a document (see `calibration.proof`).
 
@@ -44,14 +43,13 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
     hand : HandCalibration
     turns : sequence of TurnData
         Turns of the estimate.
-    settings : ByHandSettings
 
     """
     poses, model, uncorrected = hand.poses, hand.model, uncorrected_by_hand(hand)
     plain = replace(model, gyro_factor=1.0).nominal
     judged = poses.time >= (LAST_SHARE * end_by_hand(poses) if uncorrected.sizes else 0.0)
     norms, angles = [], []
-    for out, without in held_out_values(hand, turns, settings):
+    for out, without in held_out_values(hand, turns):
         values, part = applied_values(model.model, without, uncorrected.centre), _selected(poses, out & judged)
         left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last]) and judged[turn.first]]
         norms.append([np.linalg.norm(_corrected(model, each, part.force, np.zeros_like(part.force), part.temperature_c).force, axis=1)
@@ -66,9 +64,9 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData], settings: By
     return proof
 
 
-def held_out_values(hand: HandCalibration, turns: Sequence[TurnData], settings: ByHandSettings) -> list[tuple[np.ndarray, np.ndarray]]:
+def held_out_values(hand: HandCalibration, turns: Sequence[TurnData]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return (mask of the held-out poses, parameters estimated without them) of each fold; none with too few poses."""
-    folds = _folds(hand.poses, settings)
+    folds = _folds(hand.poses)
     return list(zip(folds, values_without(hand, turns, folds)))
 
 
@@ -90,12 +88,12 @@ def values_without(hand: HandCalibration, turns: Sequence[TurnData], folds: Sequ
     return found
 
 
-def _folds(poses, settings):
+def _folds(poses):
     """Return masks of the poses to hold out in turn: an eighth of them, or with few attitudes one pose; none with too few."""
     number = np.arange(len(poses.start))
     for count, least in ((FOLDS, ATTITUDES_LEAST), (len(number), FEW_ATTITUDES)):
         folds = [number % count == fold for fold in range(count)]
-        if all(distinct_attitudes(poses.force[~out], settings.pose_apart) >= least for out in folds):
+        if all(distinct_attitudes(poses.force[~out]) >= least for out in folds):
             return folds
     return []
 

@@ -84,7 +84,7 @@ class HandResult(CalibrationResult):
         force, rate = poses.force, poses.rate
         true, zero = hand.gravity * hand.state.up, np.zeros_like(rate)
         corrected_force, corrected_rate = hand.compensate(force, rate, poses.time, temperature_c=poses.temperature_c)
-        for out, values in held_out_values(hand, hand.used_turns, hand_options(self.options).settings):
+        for out, values in held_out_values(hand, hand.used_turns):
             corrected = hand.model.compensate(values, force, rate, time=poses.time, temperature_c=poses.temperature_c)
             corrected_force[out], corrected_rate[out] = (part[out] for part in corrected)
         samples = max(int(poses.stop[-1]), 1)
@@ -198,7 +198,7 @@ def evident_result(recording: HandRecording, options: CalibrationOptions = Calib
                    progress: Callable | None = None) -> tuple[HandResult, EvidentHand]:
     """Return (the HandResult, the search results); arguments as in `calibrate_samples_by_hand`, `progress` of the search."""
     asked = hand_options(options)
-    data = gather_by_hand(recording.imu, stills, asked.settings, temperature_c=recording.temperature_c)
+    data = gather_by_hand(recording.imu, stills, temperature_c=recording.temperature_c)
     evident = solve_by_evidence(data, asked, as_asked=options.as_asked, progress=progress)
     return hand_result(evident, recording, options, provenance=provenance, findings=findings, turns=data.turns), evident
 
@@ -229,7 +229,7 @@ def hand_result(evident: EvidentHand, recording: HandRecording, options: Calibra
     calibration = Calibration(replace(final, centre=dict(uncorrected.centre)), values, covariance, status,
                               gathered.frame_id, dict(hand.gauge), advice, statistics,
                               conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})},
-                              proof=prove_by_hand(hand, hand.used_turns if turns else (), hand_options(options).settings),
+                              proof=prove_by_hand(hand, hand.used_turns if turns else ()),
                               covariance_terms=terms, held_reason=reasons_held(held, model.param_names, hand.replaced, tested=CROSS_TERMS))
     needed = {name: (item['needs'], float('nan')) for item in reversed(advice) for name in item['parameters']}
     return HandResult(calibration=judged(calibration, tolerances), gathered=gathered, tolerances=tolerances, needed=needed,

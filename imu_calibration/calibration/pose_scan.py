@@ -19,7 +19,7 @@ from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.gravity.equations import Poses
 from imu_calibration.references.gravity.hand_calibration import POSES_FULL, POSES_LEAST
-from imu_calibration.references.gravity.hand_options import ByHandSettings, HandOptions
+from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.poses import average_poses, distinct_attitudes
 from imu_calibration.references.gravity.turns import collect_turns
@@ -56,12 +56,12 @@ def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> Findings:
     rests = [rest for rest in find_still(imu, windows) if rest.stop - rest.start >= 2]
     if not rests:
         return NOTHING
-    settings, seconds = ByHandSettings(), 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
+    seconds = 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
     poses = average_poses(imu, [(rest.start, rest.stop) for rest in rests])
-    turns, dropped = collect_turns(seconds, imu, poses=poses, settings=settings)
+    turns, dropped = collect_turns(seconds, imu, poses=poses)
     goes_on = seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1
     resting = float(seconds[-1] - seconds[rests[-1].start]) if goes_on else 0.0
-    return Findings(rests, poses, distinct_attitudes(poses.force, settings.pose_apart), len(turns), dropped, resting)
+    return Findings(rests, poses, distinct_attitudes(poses.force), len(turns), dropped, resting)
 
 
 def hand_status(found: Findings, calibration: Calibration | None, *, step: str,
@@ -124,7 +124,7 @@ def knowledge_of(found: Findings, result: HandResult | None, options: HandOption
     if result is not None:
         return knowledge_after(result.hand)
     model = HandModel(SensorModel(options.accelerometer or BASE, options.gyroscope or BASE, catalogue=options.catalogue), options.gravity)
-    return knowledge_at_first(model, tolerances_of(model.model, options.tolerances), options.settings, poses=found.poses)
+    return knowledge_at_first(model, tolerances_of(model.model, options.tolerances), poses=found.poses)
 
 
 def hand_coverage(found: Findings, result: HandResult | None, options: HandOptions, *, frame_id: str = '') -> Coverage:

@@ -6,7 +6,6 @@ import numpy as np
 from scipy.sparse import vstack
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.settings import setting
 from imu_calibration.kinematics.joint_motion import JointMotion, encoder_step
 from imu_calibration.kinematics.smoothing import (
     Knots,
@@ -19,6 +18,13 @@ from imu_calibration.kinematics.smoothing import (
     piece_coefficients,
     smooth,
 )
+
+ROBUSTNESS = 0.7
+"""Guard against rough fits when the smoothing is chosen: larger values admit rough accelerations, smaller ones round sharp ramps."""
+VELOCITY_SCALE = 2e-3
+"""Joint velocities are used when their scale agrees with the positions to this; filtered velocities distort the reference."""
+VELOCITY_LAG = 2e-4
+"""Largest lag of used velocities behind the positions, s; late ones imitate a time offset of the IMU."""
 
 
 class JointRows:
@@ -44,19 +50,18 @@ class JointRows:
         return PenalisedSpline(vstack([self._position[0], design], format='csr'), self._position[1] + bands, n_kinds=2)
 
 
-def fit_with_velocity(rows: JointRows, fit: Smooth, position: np.ndarray, *, velocity: np.ndarray, trend: 'Trend',
-                      settings: 'JointSettings') -> tuple[bool, Smooth]:
+def fit_with_velocity(rows: JointRows, fit: Smooth, position: np.ndarray, *, velocity: np.ndarray, trend: 'Trend') -> tuple[bool, Smooth]:
     """Return whether the velocities agree with the fit to the positions, and a fit to both when it is better for them."""
     pieces = piece_coefficients(fit.coefficients[:, None])
     trend.add_to(pieces, rows.knots)
     _, rate, acceleration = evaluate_pieces(rows.knots, pieces, rows.time, derivatives=2)[:, :, 0]
-    trusted, velocity_sd = check_velocity(velocity, rate, acceleration, dof=fit.dof, settings=settings)
+    trusted, velocity_sd = check_velocity(velocity, rate, acceleration, dof=fit.dof)
     # Information of velocities at the edge of the band, relative to positions.
     if not trusted or fit.noise_sd * fit.bandwidth / rows.knots.step < 0.3 * velocity_sd:
         return trusted, fit
     weight = np.where(np.isfinite(velocity), fit.noise_sd / velocity_sd, 0.0)
     rest = position - trend.at(rows.time)[:, 0], weight * (np.nan_to_num(velocity) - trend.at(rows.time, 1)[:, 0])
-    better, = smooth(rows.both(weight), np.concatenate(rest)[:, None], [fit.noise_sd], robustness=settings.robustness)
+    better, = smooth(rows.both(weight), np.concatenate(rest)[:, None], [fit.noise_sd], robustness=ROBUSTNESS)
     return trusted, better
 
 
@@ -100,20 +105,7 @@ class Trend:
         pieces[2] += knots.step ** 2 * self.factors[2]
 
 
-@dataclass(frozen=True)
-class JointSettings:
-    """How the joints' motion is drawn from their readings."""
-
-    robustness: float = setting(0.7, '1', 'guard against rough fits when the smoothing is chosen; 1 is plain cross-validation', (0.05, 1.0),
-                                'too large: rough accelerations now and then; too small: sharp ramps are rounded')
-    velocity_scale: float = setting(2e-3, '1', 'joint velocities are used when their scale agrees with the positions to this', (0.0, 0.1),
-                                    'too large: filtered velocities distort the reference')
-    velocity_lag: float = setting(2e-4, 's', 'joint velocities are used if their lag behind the positions is below this', (0.0, 0.1),
-                                  'too large: late velocities imitate a time offset of the IMU')
-
-
-def check_velocity(velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, *, dof: float,
-                   settings: JointSettings) -> tuple[bool, float]:
+def check_velocity(velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, *, dof: float) -> tuple[bool, float]:
     """
     Compare a joint's velocities with the derivative of its positions, ``velocity = offset + scale rate - lag acceleration + noise``.
 
@@ -125,7 +117,6 @@ def check_velocity(velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndar
         Derivatives of the smooth curve through the positions at the same stamps.
     dof : float
         Effective number of parameters of that curve: so many of its values are independent.
-    settings : JointSettings
         Largest disagreement, which must be excluded by two standard errors.
 
     Returns
@@ -147,7 +138,7 @@ def check_velocity(velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndar
     estimate = normal @ ((columns / size).T @ velocity[good]) / size
     noise_sd = np.sqrt(np.mean((velocity[good] - columns @ estimate) ** 2))
     error = noise_sd * np.sqrt(np.diag(normal) * good.sum() / max(dof, 4.0)) / size
-    limit = np.array([settings.velocity_scale * size[1], settings.velocity_scale, settings.velocity_lag])
+    limit = np.array([VELOCITY_SCALE * size[1], VELOCITY_SCALE, VELOCITY_LAG])
     return bool(np.all(np.abs(estimate - [0.0, 1.0, 0.0]) + 2 * error < limit)), float(noise_sd)
 
 
@@ -187,8 +178,7 @@ class JointCurve:
 
 
 def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray | None = None, *,
-                    noise_sd: np.ndarray | float | None = None,
-                    settings: JointSettings = JointSettings()) -> JointCurve:
+                    noise_sd: np.ndarray | float | None = None) -> JointCurve:
     """
     Return the smooth curve through readings of the joints.
 
@@ -206,8 +196,6 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
         Joint rates, rad/s; NaN where there is none.
     noise_sd : float or array, shape (n_joints,), optional
         Noise that the positions have at least, rad.
-    settings : JointSettings, optional
-        Adjustable numbers.
 
     Returns
     -------
@@ -233,12 +221,12 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
     moving = np.flatnonzero(~still).tolist()
     if len(stamps) >= _MINIMUM_SAMPLES and len(moving):
         rows = JointRows(knots, time)
-        fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving], robustness=settings.robustness)
+        fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving], robustness=ROBUSTNESS)
         for joint, fit in zip(moving, fits, strict=True):
             noise[joint] = max(floor[joint], fit.noise_sd)
             if velocity is not None:
                 trusted[joint], fit = fit_with_velocity(rows, fit, position[:, joint], velocity=velocity[:, joint],
-                                                        trend=trend.column(joint), settings=settings)
+                                                        trend=trend.column(joint))
             coefficients[:, joint], bandwidth[joint] = fit.coefficients, fit.bandwidth / (2 * np.pi * knots.step)
     pieces = piece_coefficients(coefficients)
     trend.add_to(pieces, knots)

@@ -98,7 +98,7 @@ def _by_hand(source, options, preflight):
         if any(finding.severity == REFUSE for finding in preflight.findings):
             return None
         asked = hand_options(options)
-        data = gather_by_hand(recording.imu, settings=asked.settings, temperature_c=recording.temperature_c)
+        data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
         return hand_result(EvidentHand(solve_by_hand(data, asked)), recording, options, findings=preflight.findings)
     except ImuCalibrationError as error:
         return error

@@ -25,7 +25,7 @@ def session():
 
 def test_a_good_calibration_is_proven_on_poses_and_turns(session):
     hand = solve_by_hand(session, OPTIONS)
-    proof = prove_by_hand(hand, session.turns, OPTIONS.settings)
+    proof = prove_by_hand(hand, session.turns)
     assert proof['accelerometer']['windows'] == 20 and proof['gyroscope']['unit'] == 'rad per turn' and all(decide(entry) is HELPS for entry in proof.values())
     for entry in proof.values():
         assert entry['after'] < 0.2 * entry['before'] and entry['ci95'][1] < 0.3
@@ -55,6 +55,6 @@ def test_few_attitudes_are_left_out_one_by_one_and_six_are_too_few():
     for poses, windows in ((6, None), (8, 8), (9, 9), (20, 20)):
         imu, ranges, _ = simulate(4, n_poses=poses)
         data = gather_by_hand(imu, ranges)
-        found = prove_by_hand(solve_by_hand(data, OPTIONS), data.turns, OPTIONS.settings)
+        found = prove_by_hand(solve_by_hand(data, OPTIONS), data.turns)
         assert found.get('accelerometer', {}).get('windows') == windows
         assert not found or found['accelerometer']['ci95'][1] < 1.0

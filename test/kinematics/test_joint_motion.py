@@ -6,7 +6,7 @@ from refusal import refused
 from scipy.interpolate import BSpline
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.joint_curve import JointSettings, check_velocity, fit_joint_curve
+from imu_calibration.kinematics.joint_curve import check_velocity, fit_joint_curve
 from imu_calibration.kinematics.joint_motion import JointMotion, encoder_step, with_encoder_harmonics
 from imu_calibration.kinematics.smoothing import (
     Knots,
@@ -19,7 +19,6 @@ from imu_calibration.kinematics.smoothing import (
 )
 
 STEP_0088 = np.radians(0.088)
-QUIET = JointSettings()
 
 
 def sine(time, amplitude, frequency, phase=0.3):
@@ -237,7 +236,7 @@ def test_velocities_that_agree_make_the_curve_better():
 def test_a_joint_at_rest_does_not_vouch_for_its_velocities():
     rng = np.random.default_rng(9)
     noise = 1e-5 * rng.normal(size=(3, 1000))
-    assert not check_velocity(noise[0], noise[1], noise[2], dof=100.0, settings=QUIET)[0]
+    assert not check_velocity(noise[0], noise[1], noise[2], dof=100.0)[0]
 
 
 @pytest.mark.parametrize('count', [1, 2, 3, 5, 8, 12])

@@ -20,7 +20,7 @@ from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.equations import GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
-from imu_calibration.references.gravity.hand_options import ByHandSettings, HandOptions, KnownTurn, hand_options
+from imu_calibration.references.gravity.hand_options import HandOptions, KnownTurn, hand_options
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.choices import calibration_options
@@ -279,11 +279,12 @@ def face_attitudes(ups):
     return attitudes
 
 
-def test_six_faces_leave_the_cross_axis_terms_held_and_say_what_to_do():
+def test_six_faces_leave_the_cross_axis_terms_held_and_say_what_to_do(monkeypatch):
     """Without the turns, that is: the angles between the faces as the gyroscope saw them do say something."""
     truth = NOMINAL.copy()
     imu, ranges, _ = simulate(9, n_poses=6, attitudes=face_attitudes(FACES), truth=truth)
-    found = calibrate_by_hand(imu, HandOptions(GRAVITY, settings=ByHandSettings(turn_maximum=0.5)), ranges)
+    monkeypatch.setattr('imu_calibration.references.gravity.turns.TURN_LONGEST', 0.5)
+    found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
     status = dict(zip(found.param_names, found.statuses))
     for name in ('yx', 'zx', 'zy'):
         full = f'accelerometer.matrix.{name}'
@@ -315,12 +316,6 @@ def test_too_few_attitudes_are_refused_with_their_number():
         calibrate_by_hand(imu, HandOptions(GRAVITY), [])
 
 
-def test_unknown_choice_for_g_sensitivity_is_refused():
-    imu, ranges, _ = simulate(11, n_poses=5)
-    with refused(InputError, 'choice_unknown', 'g_sensitivity'):
-        calibrate_by_hand(imu, HandOptions(GRAVITY, settings=ByHandSettings(g_sensitivity='maybe')), ranges)
-
-
 def test_clipped_and_torn_turns_are_left_out():
     imu, ranges, truth = simulate(12)
     rate, stamp_ns = np.clip(imu.rate_s, -2.2, 2.2), imu.stamp_ns.copy()
@@ -341,7 +336,7 @@ def test_g_sensitivity_enters_when_it_is_there_and_not_otherwise():
     assert 'gyroscope.gyro_g_sensitivity.xx' in found.param_names
     error, covariance = differences(found, truth)
     assert np.all(np.abs(error) < 4.5 * np.sqrt(np.diag(covariance)))
-    without = calibrate_by_hand(imu, HandOptions(GRAVITY, settings=ByHandSettings(g_sensitivity='off')), ranges)
+    without = calibrate_by_hand(imu, HandOptions(GRAVITY, gyroscope=('bias', 'matrix')), ranges)
     assert without.statistics['drift_scatter_sd'] > 5 * found.statistics['drift_scatter_sd']
     quiet = [simulate(seed, drift_sd=1e-4, n_poses=14)[:2] for seed in range(20, 25)]
     assert not any('gyroscope.gyro_g_sensitivity.xx' in calibrate_by_hand(imu, HandOptions(GRAVITY), r).param_names for imu, r in quiet)
@@ -422,7 +417,7 @@ def test_xsens_counts_against_its_factory_calibration(recordings):
     assert s['norm_chi2_per_dof'] > 5  # the scatter of the poses is real and unexplained: white noise alone would be far too sure
     assert held_out < 0.002
     # the gyroscopes' answer to gravity: chosen on the poses alone, it takes most of the scatter out of the turns, which took no part
-    without = calibrate_by_hand(imu, HandOptions(9.81744, settings=ByHandSettings(g_sensitivity='off')), ranges)
+    without = calibrate_by_hand(imu, HandOptions(9.81744, gyroscope=('bias', 'matrix')), ranges)
     assert s['turn_scatter_sd'] < 0.4 * without.statistics['turn_scatter_sd']
     assert s['g_sensitivity_heldout_ratio'] < 0.5
 

@@ -13,6 +13,8 @@ from imu_calibration.references.gravity.hand_parameters import HandModel
 
 COMPONENTS = ('pose', 'drift', 'turn')
 """Scatter beyond the noise: of the accelerometer between poses, of the gyroscope's bias, of the turns."""
+SCATTER_SD = (0.002, 1e-4, 2e-3)
+"""Their standard deviations when there are too few poses or turns to estimate them, m/s^2, rad/s, rad."""
 
 
 NEAR = 1e-3

@@ -16,9 +16,9 @@ from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.estimation.solution import HELD, statuses, tolerances_of
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import bias_movements, with_movement, without_movement
-from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State
+from imu_calibration.references.gravity.equations import COMPONENTS, SCATTER_SD, Poses, State
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
-from imu_calibration.references.gravity.hand_options import ByHandSettings, HandOptions, KnownTurn
+from imu_calibration.references.gravity.hand_options import HandOptions, KnownTurn
 from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandModel
 from imu_calibration.references.gravity.pose_solver import first_state, possible_turns, solve_joint, without_outliers
 from imu_calibration.references.gravity.poses import average_poses, distinct_attitudes, noise_statistics
@@ -158,7 +158,7 @@ def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), sti
         With fewer than four different attitudes.
 
     """
-    data = gather_by_hand(imu, stills, options.settings, known_turns=known_turns, temperature_c=temperature_c)
+    data = gather_by_hand(imu, stills, known_turns=known_turns, temperature_c=temperature_c)
     return solve_by_hand(data, options)
 
 
@@ -174,19 +174,19 @@ class HandData:
     """Attitudes, excluded turns, noise and period of the samples."""
 
 
-def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, settings: ByHandSettings = ByHandSettings(), *,
+def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, *,
                    known_turns: Sequence[KnownTurn] = (), temperature_c: np.ndarray | None = None) -> HandData:
     """Return the `HandData` of samples; arguments and errors as in `calibrate_by_hand`."""
     time = sample_times(imu)
     poses = average_poses(imu, _as_ranges(imu, stills), temperature_c)
-    attitudes = distinct_attitudes(poses.force, settings.pose_apart)
+    attitudes = distinct_attitudes(poses.force)
     if attitudes < POSES_LEAST:
         raise NotObservableError(
             f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all parameters), '
             f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes, '
             'or describe the table or arm that moved it', key='table', code='too_few_attitudes')
-    turns, dropped = collect_turns(time, imu, poses=poses, settings=settings, temperature_c=temperature_c)
-    turns += [known_turn_data(time, imu, turn, poses=poses, settings=settings, temperature_c=temperature_c) for turn in known_turns]
+    turns, dropped = collect_turns(time, imu, poses=poses, temperature_c=temperature_c)
+    turns += [known_turn_data(time, imu, turn, poses=poses, temperature_c=temperature_c) for turn in known_turns]
     return HandData(poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)})
 
 
@@ -197,9 +197,8 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     See `calibrate_by_hand`. `point`: effect -> values at which its columns are first computed.
     """
     report('solving')
-    poses, turns, settings = data.poses, data.turns, options.settings
-    fallback = np.square([settings.pose_scatter, settings.drift_scatter, settings.turn_scatter])
-    default, evidence = default_gyroscope(poses, settings)
+    poses, turns = data.poses, data.turns
+    default, evidence = default_gyroscope(poses)
     reference_c = 25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
     sensors = SensorModel(options.accelerometer or BASE, options.gyroscope or default, temperature_ref_c=reference_c, point=point or {},
                           catalogue=options.catalogue)
@@ -209,7 +208,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     model = replace(model, gyro_factor=full_scale_factor(state, poses, turns))
     turns, contradicted = possible_turns(model, state, poses, turns=turns)
     left = {'contradicted by gravity': contradicted} if contradicted else {}
-    solved = partial(solve_joint, gravity_sd=options.gravity_sd, fallback=fallback)
+    solved = partial(solve_joint, gravity_sd=options.gravity_sd, fallback=np.square(SCATTER_SD))
     for effect in model.extras:
         if effect.time_constant and effect.name not in (point or {}):   # a time constant far from the prior does not converge from there
             trials = [replace(model, model=each) for each in at_time_constants(model.model, effect, float(poses.time[-1]))]
@@ -275,14 +274,10 @@ def _check_temperature(model, poses):
         raise InputError(f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or omit it')
 
 
-def default_gyroscope(poses: Poses, settings: ByHandSettings) -> tuple[tuple[str, ...], dict]:
+def default_gyroscope(poses: Poses) -> tuple[tuple[str, ...], dict]:
     """Return (the gyroscope's effects without a request, the evidence of the poses for g-sensitivity)."""
-    if settings.g_sensitivity not in ('auto', 'on', 'off'):
-        raise InputError(f"setting 'g_sensitivity' must be auto, on or off, got {settings.g_sensitivity!r}; choose one of them",
-                         code='choice_unknown')
     evidence = g_sensitivity_evidence(poses)
-    wanted = settings.g_sensitivity == 'on' or (settings.g_sensitivity == 'auto' and shown(evidence))
-    return G_SENSITIVE if wanted else BASE, evidence
+    return G_SENSITIVE if shown(evidence) else BASE, evidence
 
 
 def _statistics(model, found, poses, turns):

@@ -1,9 +1,8 @@
-"""Options of a calibration by hand: effects, reference, settings."""
+"""Options of a calibration by hand: effects, reference."""
 
 from dataclasses import dataclass, field
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.settings import setting
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
@@ -12,27 +11,6 @@ from imu_calibration.references.options import CalibrationOptions
 
 GRAVITY_LEAST, GRAVITY_MOST = 9.7, 9.9
 """Smallest and largest gravity on the surface of the Earth with a margin, m/s^2: 9.764 on a mountain in Peru, 9.834 in the Arctic."""
-
-
-@dataclass(frozen=True)
-class ByHandSettings:
-    """Numbers for calibration by hand."""
-
-    pose_apart: float = setting(0.2, 'rad', 'attitudes closer than this count as one pose', (0.001, 1.5), '')
-    turn_maximum: float = setting(30.0, 's', 'longer stretches between two poses are not used for the gyroscope', (0.5, 3600.0),
-                                  'too small: few turns; too large: gyroscope drift and clipping enter')
-    gap: float = setting(0.1, 's', 'a turn with a longer hole in it is not used; never below five periods', (0.001, 60.0),
-                         'too large: rotation is lost in holes and shows as turn scatter')
-    pose_scatter: float = setting(0.002, 'm/s^2', 'scatter of poses, when there are too few to estimate it', (0.0, 1.0), '')
-    drift_scatter: float = setting(1e-4, 'rad/s', 'scatter of the gyroscope bias, when there are too few poses to estimate it',
-                                   (0.0, 1.0), '')
-    turn_scatter: float = setting(2e-3, 'rad', 'scatter of the turns, when there are too few to estimate it', (0.0, 1.0), '')
-    known_turn_sd: float = setting(0.017, 'rad', 'accuracy of the angle of full turns made by hand', (1e-6, 1.0),
-                                   'too small: scales too sure')
-    known_axis_sd: float = setting(0.017, 'rad', 'accuracy of the axis of full turns made by hand', (1e-6, 1.0),
-                                   'too small: misalignments too sure')
-    g_sensitivity: str = setting('auto', '', "'on', 'off', or 'auto': in the model when the poses show it",
-                                 symptom="off: it shows as drift and turn scatter")
 
 
 @dataclass(frozen=True)
@@ -57,14 +35,12 @@ class HandOptions:
     """Local gravity, m/s^2."""
     gravity_sd: float = 0.0
     """Its standard deviation, m/s^2."""
-    settings: ByHandSettings = ByHandSettings()
-    """Numbers."""
     tolerances: dict = field(default_factory=dict)
     """{sensor: {effect: sufficient sd}}; by default the catalogue's."""
     accelerometer: tuple[str, ...] | None = None
     """Effects to estimate; None: bias and matrix."""
     gyroscope: tuple[str, ...] | None = None
-    """The same; None: bias and matrix, and the g-sensitivity according to the settings and the poses."""
+    """The same; None: bias and matrix, and the g-sensitivity when the poses show it."""
     catalogue: Catalogue = CATALOGUE
     """Declarations of the effects."""
 

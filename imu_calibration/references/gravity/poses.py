@@ -12,6 +12,8 @@ from imu_calibration.references.gravity.equations import Poses
 CREEPS = 3.0
 """Mean square of the slopes of forces across gravity, relative to its expectation from noise, above which poses creep."""
 
+ATTITUDES_APART = 0.2
+"""Attitudes closer than this count as one pose, rad."""
 DITHER = 3.0
 """Variance of readings over that of rounding below which rounding is not averaged: half a step; 1 % of a step remains above."""
 
@@ -87,10 +89,10 @@ def _pooled_noise(parts, rounding, pieces=8):
     return NoiseModel(within**2, np.where(ratio > 1 + margin, ratio, 1.0))
 
 
-def distinct_attitudes(force: np.ndarray, apart: float) -> int:
-    """Return how many of the mean readings (k, 3) point in directions more than `apart` rad from each other."""
+def distinct_attitudes(force: np.ndarray) -> int:
+    """Return how many of the mean readings (k, 3) point in directions more than `ATTITUDES_APART` from each other."""
     kept = []
     for direction in force / np.linalg.norm(force, axis=1, keepdims=True):
-        if all(np.arccos(np.clip(direction @ other, -1, 1)) > apart for other in kept):
+        if all(np.arccos(np.clip(direction @ other, -1, 1)) > ATTITUDES_APART for other in kept):
             kept.append(direction)
     return len(kept)

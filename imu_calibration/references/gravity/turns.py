@@ -9,7 +9,7 @@ from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.preprocessing.full_scale import LEAST_TURNS, MOST_TURNS, believed_factor
 from imu_calibration.preprocessing.stamping import LAG, LATE, MOST_LOST, WHOLE
 from imu_calibration.references.gravity.equations import Poses, State, TurnData
-from imu_calibration.references.gravity.hand_options import ByHandSettings, KnownTurn
+from imu_calibration.references.gravity.hand_options import KnownTurn
 
 TOP = 20
 """Readings below the largest whose density is estimated."""
@@ -21,20 +21,26 @@ LINE = 20.0
 """Duration over which a clock is straight, s: long against the jitter of its stamps, short against the drift of its rate."""
 UNDECIDED = 1.02
 """Factor by which interpolation errors at even times may exceed those at the stamps, due to noise."""
+TURN_LONGEST = 30.0
+"""Longer stretches between two poses are not used, s: drift and clipping enter."""
+GAP = 0.1
+"""A turn with a longer hole in it is not used, s; never below five periods."""
+KNOWN_TURN_SD = 0.017
+"""Accuracy of the angle and of the axis of full turns made by hand, rad."""
 SUMMIT = 3
 """Neighbours in one coarse step at the top of a smooth turn."""
 
 
-def collect_turns(time: np.ndarray, imu: ImuSamples, *, poses: Poses, settings: ByHandSettings,
+def collect_turns(time: np.ndarray, imu: ImuSamples, *, poses: Poses,
                   temperature_c: np.ndarray | None = None) -> tuple[list[TurnData], dict[str, int]]:
     """Return (turns between consecutive poses, {reason: count of excluded ones}); `temperature_c` is that of the samples or None."""
     turns, dropped, rate = [], {}, imu.rate_s
-    limit = max(settings.gap, 5 * poses.period)
+    limit = max(GAP, 5 * poses.period)
     ended = at_range_end(rate)
     density = np.mean(poses.noise['gyroscope'].low_variance) * poses.period
     for first in range(len(poses.start) - 1):
         piece = slice(poses.stop[first] - 1, poses.start[first + 1] + 1)
-        reason = _unusable(time[piece], ended[piece], limit, settings.turn_maximum)
+        reason = _unusable(time[piece], ended[piece], limit)
         if reason:
             dropped[reason] = dropped.get(reason, 0) + 1
             continue
@@ -43,8 +49,8 @@ def collect_turns(time: np.ndarray, imu: ImuSamples, *, poses: Poses, settings: 
     return turns, dropped
 
 
-def _unusable(time, ended, gap, longest):
-    if time[-1] - time[0] > longest:
+def _unusable(time, ended, gap):
+    if time[-1] - time[0] > TURN_LONGEST:
         return 'too long'
     if np.max(np.diff(time)) > gap:
         return 'gap'
@@ -89,12 +95,12 @@ def _at_end(values, fresh):
     return at if number >= max(2, CROWDED * chance) else np.zeros(len(values), bool)
 
 
-def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, *, poses: Poses, settings: ByHandSettings,
+def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, *, poses: Poses,
                     temperature_c: np.ndarray | None = None) -> TurnData:
-    """Return the data of a `KnownTurn`; the sd of its axis is that of the settings, across the axis."""
+    """Return the data of a `KnownTurn`; `KNOWN_TURN_SD` applies along and, for the axis, across it."""
     axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
     along = np.outer(axis, axis)
-    cov = settings.known_turn_sd**2 * along + (turn.angle * settings.known_axis_sd)**2 * (np.eye(3) - along)
+    cov = KNOWN_TURN_SD**2 * along + (turn.angle * KNOWN_TURN_SD)**2 * (np.eye(3) - along)
     piece = slice(turn.start, turn.stop)
     density = np.mean(poses.noise['gyroscope'].white_variance) * poses.period
     noise_variance = density * (time[piece][-1] - time[piece][0])
