@@ -70,17 +70,14 @@ class EvidentResult:
 
 
 def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
-                          provenance: dict | None = None, progress: Callable | None = None, asking: Callable | None = None,
-                          mapper: Callable = map, names: Sequence[str] | None = None) -> EvidentResult:
+                          provenance: dict | None = None, mapper: Callable = map, names: Sequence[str] | None = None) -> EvidentResult:
     """
     Calibrate from one or several recordings of the same IMU; effects that they support are added to the requested model.
 
     Parameters
     ----------
-    sources, table, options, provenance, progress, mapper, names
+    sources, table, options, provenance, mapper, names
         As for `calibrate`.
-    asking : callable, optional
-        Called with the completed share of the search.
 
     Raises
     ------
@@ -88,14 +85,14 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
         As `calibrate`.
 
     """
-    solve = partial(solve_recordings, sources, table, progress=progress, mapper=mapper, names=names)
-    found = solve_by_evidence(solve(options, keep_windows=not options.as_asked), table, options, solve_again=solve, asking=asking)
+    solve = partial(solve_recordings, sources, table, mapper=mapper, names=names)
+    found = solve_by_evidence(solve(options, keep_windows=not options.as_asked), table, options, solve_again=solve)
     return EvidentResult(conclude(found.solution, found.gathered, found.model, table=table, options=found.demand.options(options),
                                   provenance=provenance, changes=found.demand.changes), found.found)
 
 
-def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, *, solve_again: Callable[[CalibrationOptions], Solved],
-                      asking: Callable | None = None) -> EvidentSolution:
+def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, *,
+                      solve_again: Callable[[CalibrationOptions], Solved]) -> EvidentSolution:
     """
     Return the solution of the requested model with the effects that the recordings support.
 
@@ -108,8 +105,6 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
         Options of the requested model.
     solve_again : callable
         Returns the same for other options: `added` effects, linearised at their `point`.
-    asking : callable, optional
-        Called with the completed share of the search.
 
     """
     solution, gathered, model = first
@@ -117,11 +112,9 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
     if not parts:
         return EvidentSolution(*first)
     baseline = baseline_model(options, table, solution.model)
-    found, *others = (inquire(windows, table, baseline, progress=asking, bias_processes=options.bias_processes) for windows in parts)
+    found, *others = (inquire(windows, table, baseline, bias_processes=options.bias_processes) for windows in parts)
     for each in (found, *others):
         each.free()   # the solutions below need that memory
-    if asking:
-        asking(1.0)
     found, more = _without_faint(found, solution), _named_elsewhere(found, others)
     added, point = (), {}
     while beyond := _beyond((*found.adopted, *more), first[2]):
@@ -141,8 +134,7 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
     return EvidentSolution(demand.applied(solution), gathered, model, demand, found)
 
 
-def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known: Demand,
-             asking: Callable | None = None) -> EvidentSolution:
+def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known: Demand) -> EvidentSolution:
     """
     Return the supported effects when columns cannot be recomputed: missing effects are reported and widen the covariance.
 
@@ -150,7 +142,7 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
     ----------
     solved : tuple
         As for `solve_by_evidence`, of the requested model with the added effects.
-    table, options, asking
+    table, options
         As for `solve_by_evidence`.
     known : Demand
         The effects that were supported when the columns were computed.
@@ -160,8 +152,7 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
     parts = windows_to_ask(gathered)
     if not parts:
         return EvidentSolution(*solved, known)
-    found = inquire(parts[0], table, baseline_model(options, table, solution.model), progress=asking,
-                    bias_processes=options.bias_processes)
+    found = inquire(parts[0], table, baseline_model(options, table, solution.model), bias_processes=options.bias_processes)
     found = _without_faint(found, solution)
     lacking = [] if found.limits else _beyond(found.adopted, model)   # after a limit was found, the solution is that of the search
     changes = replace(_changes([found], known.added), lacking=tuple(question.name for question in lacking))

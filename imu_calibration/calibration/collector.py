@@ -297,8 +297,6 @@ class GatherStep:
     """Names of the recordings for messages; with several of them an error names the one at fault."""
     spread: bool = False
     """Whether windows are kept for the search of effects."""
-    progress: Callable[[int], object] | None = None
-    """Called with the number of IMU samples read so far."""
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
 
@@ -321,12 +319,8 @@ class GatherStep:
         """
         collector = Collector(self.table, self.model, self.windows, nominal=self.nominal, session=session, watchers=(preflight,),
                               windows=windows, spread=self.spread, judged_from=self.judged_from)
-        count = 0
         for block in blocks:
             collector.push(block)
-            count += 0 if block.imu is None else len(block.imu)
-            if self.progress is not None:
-                self.progress(count)
         gathered = collector.finish()
         gathered.findings = preflight.findings
         return gathered

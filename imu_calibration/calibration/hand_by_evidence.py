@@ -1,6 +1,5 @@
 """Common model selection for `calibrate` and `diagnose` by hand: the model has the effects that the poses and turns support."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -30,8 +29,7 @@ class EvidentHand:
     """Changes of the requested model by the evidence."""
 
 
-def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, as_asked: bool = False,
-                      progress: Callable | None = None) -> EvidentHand:
+def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, as_asked: bool = False) -> EvidentHand:
     """
     Estimate from poses and turns, with the supported effects in addition to the requested model (`investigate_by_hand`).
 
@@ -41,8 +39,6 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
     options : HandOptions
     as_asked : bool
         Whether the model is exactly the requested one.
-    progress : callable, optional
-        Called with the share of the search that is done.
 
     Raises
     ------
@@ -53,7 +49,7 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
     from imu_calibration.references.gravity.model_selection import POSES_LEAST, investigate_by_hand  # here, because its import is slow
     if as_asked or len(data.poses.start) < POSES_LEAST:
         return EvidentHand(solve_by_hand(data, options))
-    found, asked = investigate_by_hand(data, options, progress), _asked(data, options)
+    found, asked = investigate_by_hand(data, options), _asked(data, options)
     while faint := _faint(hand := _solved(data, found, options), found, asked):
         found = replace(found, named=[q for q in found.named if q not in faint], denied=[*found.denied, *faint])
     added = tuple(q.name for q in found.adopted if q.name not in asked[q.sensor])

@@ -194,12 +194,11 @@ def calibrate_samples_by_hand(recording: HandRecording, options: CalibrationOpti
 
 
 def evident_result(recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None, *,
-                   stills: Sequence[slice] | None = None, findings: Sequence[CheckFinding] = (),
-                   progress: Callable | None = None) -> tuple[HandResult, EvidentHand]:
-    """Return (the HandResult, the search results); arguments as in `calibrate_samples_by_hand`, `progress` of the search."""
+                   stills: Sequence[slice] | None = None, findings: Sequence[CheckFinding] = ()) -> tuple[HandResult, EvidentHand]:
+    """Return (the HandResult, the search results); arguments as in `calibrate_samples_by_hand`."""
     asked = hand_options(options)
     data = gather_by_hand(recording.imu, stills, temperature_c=recording.temperature_c)
-    evident = solve_by_evidence(data, asked, as_asked=options.as_asked, progress=progress)
+    evident = solve_by_evidence(data, asked, as_asked=options.as_asked)
     return hand_result(evident, recording, options, provenance=provenance, findings=findings, turns=data.turns), evident
 
 

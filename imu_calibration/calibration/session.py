@@ -1,6 +1,5 @@
 """Common interface of live calibrations, and the snapshot that a worker solves."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -67,11 +66,11 @@ class LiveSnapshot:
         asked = self.model_for(options)
         return solve_in_passes(self.model if asked.has_columns_of(self.model) else asked, options, solved)
 
-    def evidence(self, asking: Callable | None = None) -> EvidentSolution:
-        """Return the solution with the supported effects, as `calibrate_by_evidence`; `asking` is called with the completed share."""
+    def evidence(self) -> EvidentSolution:
+        """Return the solution with the supported effects, as `calibrate_by_evidence`."""
         if self.store.complete:
-            return solve_by_evidence(self.solved(self.options), self.table, self.options, solve_again=self.solved, asking=asking)
-        return ask_kept(self.solved(self.demand.options(self.options)), self.table, self.options, known=self.demand, asking=asking)
+            return solve_by_evidence(self.solved(self.options), self.table, self.options, solve_again=self.solved)
+        return ask_kept(self.solved(self.demand.options(self.options)), self.table, self.options, known=self.demand)
 
 
 @dataclass(frozen=True)

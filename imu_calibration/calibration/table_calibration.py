@@ -37,7 +37,7 @@ from imu_calibration.selection.questions import PASSES, at_time_constants, linea
 
 
 def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
-              provenance: dict | None = None, progress: Callable | None = None, mapper: Callable = map,
+              provenance: dict | None = None, mapper: Callable = map,
               names: Sequence[str] | None = None) -> TableResult:
     """
     Calibrate from one or several recordings of the same IMU on a table.
@@ -51,8 +51,6 @@ def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOpt
     options : CalibrationOptions
     provenance : dict, optional
         Bag names, hashes and options for the document.
-    progress : callable, optional
-        Called with the number of IMU samples read.
     mapper : callable
         Applies the map step to the recordings; `map`, or the `map` of a pool.
     names : sequence of str, optional
@@ -68,12 +66,12 @@ def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOpt
         When a recording cannot be used or is of another frame, with its name when there are several.
 
     """
-    return conclude(*solve_recordings(sources, table, options, progress=progress, mapper=mapper, names=names), table=table, options=options,
+    return conclude(*solve_recordings(sources, table, options, mapper=mapper, names=names), table=table, options=options,
                     provenance=provenance)
 
 
 def solve_recordings(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
-                     progress: Callable | None = None, mapper: Callable = map, names: Sequence[str] | None = None,
+                     mapper: Callable = map, names: Sequence[str] | None = None,
                      keep_windows: bool = False) -> tuple[Solution, Gathered, SensorModel]:
     """
     Return (Solution, Gathered, SensorModel of the gathered columns) of recordings; arguments as in `calibrate`.
@@ -87,7 +85,7 @@ def solve_recordings(sources: Sequence[Callable], table: Table, options: Calibra
         model = model.with_reference_temperature(_first_temperature(sources))
 
     def solved(model, judged_from):
-        step = GatherStep(table, model, options.windows, options.nominal, names, keep_windows, progress, judged_from)
+        step = GatherStep(table, model, options.windows, options.nominal, names, keep_windows, judged_from)
         gathered = join(list(mapper(step, enumerate(sources))), names, partial(check_units, model=model, table=table))
         report('solving')
         return solve_gathered(gathered, model, options), gathered
@@ -231,8 +229,7 @@ class CheckResult:
 
 
 def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calibration, *,
-                   options: CalibrationOptions = CalibrationOptions(), names: Sequence[str] = (),
-                   progress: Callable | None = None) -> CheckResult:
+                   options: CalibrationOptions = CalibrationOptions(), names: Sequence[str] = ()) -> CheckResult:
     """
     Return the errors of a calibration on recordings of its IMU on a table, of the readings that compensation writes.
 
@@ -247,8 +244,6 @@ def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calib
         How windows are found, and the conversion of volts or counts.
     names : sequence of str
         Names of the recordings for messages.
-    progress : callable, optional
-        Called with the number of IMU samples read.
 
     Raises
     ------
@@ -258,7 +253,7 @@ def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calib
     """
     names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
     model, before, after, parts = reference_model(calibration, table), HeldOut(), HeldOut(), []
-    step = GatherStep(table, model, options.windows, options.nominal, names, progress=progress)
+    step = GatherStep(table, model, options.windows, options.nominal, names)
     for session, source in enumerate(sources):
         windows: list[Window] = []
         parts.append(naming(names, session)(step.read, _with_corrected(source, calibration, options), session,

@@ -45,13 +45,11 @@ def run(options: Namespace) -> VerbResult:
     if options.by_hand and options.motion == 'any':
         return _run_by_hand(options)
     stand = _stand(options)
-    from imu_calibration.core.progress import report
     from imu_calibration.document import files
     from imu_calibration.planning.planner import plan_to_mapping
     from imu_calibration.use_cases.plan import plan
     with files.output_folder(options.output) as folder:
         made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate,
-                    progress=lambda share: report('planning', share, 1.0),
                     with_bound=not options.no_bound, separate=[name for name in options.separate.split(',') if name],
                     diagnosis=options.diagnosis, around=_pose(options.around), reach=options.reach,
                     **{name: getattr(options, name) for name in CHOICES})

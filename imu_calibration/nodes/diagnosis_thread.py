@@ -10,6 +10,8 @@ from typing import Any
 from imu_calibration.calibration.diagnosis.live_diagnosis import FAILED, OFF, Answer, DiagnosisQuestion, DiagnosisState
 from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.session import SolvePacer
+from imu_calibration.core.progress import listening
+from imu_calibration.selection.reduced_recording import REDUCING
 
 THRESHOLD = 256 * 1024
 """Bytes from which an array has separate pages, which are returned when it is freed; glibc raises its threshold to 32 MB, so that arrays
@@ -123,7 +125,8 @@ class DiagnosisThread:
 
     def _answer(self, question, start, session):
         try:
-            answer = question.answer(lambda share: self._go_on(session))
+            with listening(lambda phase, done, total: self._go_on(session, phase)):
+                answer = question.answer()
         except _Ended:
             return
         except Exception as error:   # a diagnosis that fails must not end the calibration
@@ -153,11 +156,12 @@ class DiagnosisThread:
         if self._thread is not None:
             self._thread.join(timeout)
 
-    def _go_on(self, session):
+    def _go_on(self, session, phase):
         """End a diagnosis that nobody waits for; otherwise return the memory that its last step freed."""
         if self._ending or session != self._session:
             raise _Ended
-        return_freed_memory()
+        if phase == REDUCING:
+            return_freed_memory()
 
     def end(self, timeout: float = 10.0) -> None:
         """Cancel the diagnosis, and wait for the thread."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from imu_calibration.core.progress import report
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel, ReferenceNoise
@@ -55,7 +56,7 @@ class Offers:
 
 
 def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None, first: Sequence[int] = (),
-           progress: Callable[[float], None] | None = None, longest: float = np.inf) -> list[int]:
+           longest: float = np.inf) -> list[int]:
     """
     Return motions that reach the goal, or the smallest distance to it, each with the best gain per second at its step.
 
@@ -68,8 +69,6 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
         Information about z in addition to the prior.
     first : sequence of int
         Mandatory first motions.
-    progress : callable, optional
-        Called with the completed share.
     longest : float
         Time at most, s.
 
@@ -93,8 +92,7 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
         spent += float(choice.seconds[number])
         place = int(situation.repertoire.place_of[number])
         left = situation.goal.left(belief.known[None], margin)[0]
-        if progress is not None:
-            progress(1.0 - left / max(beginning, 1e-9))
+        report('planning', 1.0 - left / max(beginning, 1e-9), 1.0)
         if left == 0.0 and len(chosen) >= len(first):
             if meets(situation, chosen, start, known=known):
                 break
@@ -265,15 +263,14 @@ class Planner:
             return None
         return PlannedMotion(MotionKind.MOVE, repertoire.names, np.where(far, middle, position), (), 'unwinding', limits)
 
-    def plan(self, position: np.ndarray | None = None, *, progress: Callable[[float], None] | None = None,
-             with_bound: bool = True, longest: float = np.inf) -> Plan:
+    def plan(self, position: np.ndarray | None = None, *, with_bound: bool = True, longest: float = np.inf) -> Plan:
         """Return a whole plan from the present position (default: home)."""
         situation = self.situation
         start = situation.repertoire.spread[0] if position is None else np.asarray(position, float)
         place = situation.place_near(start)
         first = () if self.known is not None else situation.first_rests(place)
         self.within(longest)
-        sequence = self._sequence(place, first, progress=progress, longest=longest)
+        sequence = self._sequence(place, first, longest)
         bound, goal = float('nan'), situation.goal
         if with_bound and isinstance(goal, WithinTolerances):
             windows, _, seconds = situation.timed(sequence, place)
@@ -283,15 +280,15 @@ class Planner:
             if seconds > WORTH * bound:   # what limits the relaxed plan counts more: a second attempt
                 weights = np.maximum(relaxed.weights / relaxed.weights.max(), LEAST_WEIGHT)
                 situation.goal = WithinTolerances(situation.coordinates, weights)
-                other = self._sequence(place, first, progress=None, longest=longest)
+                other = self._sequence(place, first, longest)
                 situation.goal = goal
                 windows, _, less = situation.timed(other, place)
                 if less < seconds and meets(situation, other, place, known=self.known):
                     sequence, bound = other, situation.lower_bound(self.known, factor=situation.variance_factor(windows, self.known))
         return self._plan_of(sequence, start, place, bound)
 
-    def _sequence(self, place, first, *, progress, longest):
-        sequence = greedy(self.situation, place, known=self.known, first=first, progress=progress, longest=longest)
+    def _sequence(self, place, first, longest):
+        sequence = greedy(self.situation, place, known=self.known, first=first, longest=longest)
         return exchanged(self.situation, sequence, place, known=self.known, fixed=len(first))
 
     def within(self, seconds: float) -> None:

@@ -1,6 +1,6 @@
 """The recording reduced around a point of linearisation, the search on it, and the decision whether to relinearise."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
@@ -54,8 +54,6 @@ class Attempt:
         Mask of the windows reserved for the gain: they have columns, but are excluded from noise, fits and choices.
     bias_processes : dict, optional
         Sensor -> its bias processes, where measured separately.
-    progress : callable, optional
-        Called with the share that is done.
     any_size : bool
         Whether sizes above those of any known instrument are allowed.
     resolved : set of str
@@ -64,15 +62,14 @@ class Attempt:
     """
 
     def __init__(self, windows: Sequence[Window], table: Table, baseline: SensorModel, *, effects: Sequence[Effect], locked: np.ndarray,
-                 point: tuple[SensorModel, np.ndarray] | None = None, bias_processes: dict | None = None, progress: Callable | None = None,
+                 point: tuple[SensorModel, np.ndarray] | None = None, bias_processes: dict | None = None,
                  any_size: bool = False, resolved: AbstractSet[str] = frozenset()):
         self.baseline, self.effects, self.locked = baseline, effects, locked
         self.duration = max(float(window.time[-1]) for window in windows)
         self.constants = time_constants(self.duration)
         model, values = point or _start(baseline, effects)
         model = replace(model, folded_arms=mean_arms(model, values))
-        recording = reduce_recording(windows, table, model, values=values, bank=make_bank(effects, self.constants, model, values=values),
-                                     progress=progress)
+        recording = reduce_recording(windows, table, model, values=values, bank=make_bank(effects, self.constants, model, values=values))
         used, judged = baseline_parameters(baseline, model), recording.select(~locked)
         if point is None:
             judged = _at_baseline(judged, baseline, used)

@@ -1,6 +1,6 @@
 """The search from windows to named effects: remove clipped samples, linearise, choose, prove, relinearise."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -61,8 +61,7 @@ class Investigation(Named):
         return self.attempt.search
 
 
-def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
-                bias_processes: dict | None = None) -> Investigation:
+def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, bias_processes: dict | None = None) -> Investigation:
     """
     Test every effect that a model lacks on held-out windows.
 
@@ -76,8 +75,6 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
         The reference.
     model : SensorModel
         The model to be extended.
-    progress : callable, optional
-        Called with the share that is done, in [0, 1].
     bias_processes : dict, optional
         Sensor -> its bias processes, where measured separately.
 
@@ -90,14 +87,12 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     used = [window for window in windows if window.kind != 'unused']
     if len(used) < LEAST_WINDOWS:
         raise too_few_windows(len(used))
-    report = progress or (lambda share: None)
     model = with_joints_of(model, table)
     used, locked, limits = without_clipping(used, table, model)
     effects, not_testable = testable_effects(model, table, windows_at(used, ~locked))
     asked = without_saturation(effects)
     attempted = partial(Attempt, used, table, model, effects=asked, locked=locked, bias_processes=bias_processes)
-    attempt = attempted(progress=lambda share: report(0.4 * share))
-    report(0.4)
+    attempt = attempted()
     outcome, rivals, again = _explained(attempt, attempted)
     onset = find_onset(outcome.attempt, outcome.explained, outcome.named, windows=used, table=table) if outcome.rest else None
     step = next((effect for effect in effects if effect.located), None)
@@ -109,9 +104,8 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
             outcome, rivals, again, onset = other, others, beside, None
     if onset is not None:
         longer = max([w for w in used if w.time[-1] < onset.time], [w for w in used if w.time[0] >= onset.time], key=len)
-        return replace(investigate(longer, table, model, progress=progress, bias_processes=bias_processes), onset=onset)
+        return replace(investigate(longer, table, model, bias_processes=bias_processes), onset=onset)
     attempted = again
-    report(0.75)
     for any_size in (False, True):
         outcome = _looked_again(outcome, partial(attempted, any_size=any_size), any_size)
     attempt, named, denied = outcome.attempt, outcome.named, outcome.denied
@@ -198,12 +192,12 @@ def _looked_again(outcome, attempted, any_size):
     return other if other.rest < LEFT * outcome.rest else outcome
 
 
-def _settled(attempted, attempt, chosen, progress=None):
+def _settled(attempted, attempt, chosen):
     """Return the _Outcome of a choice: relinearise at the effects, then keep those with sufficient share and gain."""
     for _ in range(LINEARISATIONS - 1):
         if not attempt.needs_another(chosen):
             break
-        attempt = attempted(point=attempt.point(chosen), progress=progress)
+        attempt = attempted(point=attempt.point(chosen))
         chosen = _searched(attempt, chosen)
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]

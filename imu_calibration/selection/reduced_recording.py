@@ -1,12 +1,13 @@
 """A recording reduced to factors: columns at a bank of time constants, windows of the recent past."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from imu_calibration.core.progress import report
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import References, all_arms, coefficients, columns, effect_slopes
 from imu_calibration.effects.sensor_model import SensorModel
@@ -101,6 +102,8 @@ def _entry(effect, number, constant, model, values):
 
 PARTS = ('within', 'slow')
 """Triangular factors of a window: of all centred rows, and of the means of short pieces."""
+REDUCING = 'reducing the recording'
+"""Phase of the progress."""
 BATCH = 32
 """Windows whose factors are unpacked at a time."""
 MOST_SUMS = 32
@@ -256,8 +259,8 @@ class ReducedRecording:
         return replace(self.windows[k], sensors=sensors)
 
 
-def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray, bank: dict[str, list[BankEntry]],
-                     progress: Callable | None = None) -> ReducedRecording:
+def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray,
+                     bank: dict[str, list[BankEntry]]) -> ReducedRecording:
     """
     Reduce windows with the columns of a model and a bank of time constants.
 
@@ -271,8 +274,6 @@ def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel
         Parameters that residuals belong to.
     bank : dict
         Sensor -> list of BankEntry (`make_bank`).
-    progress : callable, optional
-        Called with the share that is done, in [0, 1].
 
     """
     def with_bank(model, sensor, table, motion, temperature_c=None, references: References | None = None):
@@ -290,8 +291,7 @@ def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel
                 kept.append(PackedFactor.of(window.sensors[sensor].within[:0] if factor is None else factor))
             reduced.append(replace(window, sensors={sensor: replace(known, within=known.within[:0].copy(), slow=None)
                                                     for sensor, known in window.sensors.items()}))
-        if progress:
-            progress(len(reduced) / len(windows))
+        report(REDUCING, len(reduced), len(windows))
     descriptions = [_describe(window) for window in windows]
     return ReducedRecording(model, values, bank, tuple(reduced), factors,
                             {name: np.array([d[name] for d in descriptions]) for name in descriptions[0]})

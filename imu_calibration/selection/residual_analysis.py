@@ -1,6 +1,6 @@
 """The search of `calibrate` and `diagnose`: supported effects, without findings that a formula or a regime replaces."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
@@ -99,14 +99,13 @@ class Examination(Investigation):
         return other
 
 
-def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
-            bias_processes: dict | None = None) -> Examination:
+def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, bias_processes: dict | None = None) -> Examination:
     """
     Test every effect that a model lacks (`investigate`), and withdraw findings that a formula or a regime replaces.
 
     Parameters
     ----------
-    windows, table, model, progress, bias_processes
+    windows, table, model, bias_processes
         As for `investigate`.
 
     Raises
@@ -115,7 +114,7 @@ def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, prog
         As `investigate`.
 
     """
-    return without_superseded(Examination.of(investigate(windows, table, model, progress=progress, bias_processes=bias_processes), table))
+    return without_superseded(Examination.of(investigate(windows, table, model, bias_processes=bias_processes), table))
 
 
 def without_superseded(found: Examination) -> Examination:

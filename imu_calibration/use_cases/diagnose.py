@@ -8,7 +8,7 @@ from typing import Unpack
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult, diagnose_recording, diagnose_without_table
 from imu_calibration.calibration.result import exit_code
-from imu_calibration.core.progress import counter, report
+from imu_calibration.core.progress import report
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
@@ -116,7 +116,6 @@ def diagnose(recording: str | PathLike | SampleBlock, table: Stand | None = None
     provenance = provenance_with('diagnose', [recording], choices, stand=table)
     table = None if table is None else table_of(table, [recording], topics, gravity=options.gravity)
     source = source_of(recording, topics, None if table is None else table.joint_names)
-    advance = counter('diagnosing', 100)
     if table is None:
-        return Diagnosed(diagnose_without_table(source, options, provenance, progress=advance))
-    return Diagnosed(diagnose_recording(source, table, options, provenance=provenance, progress=advance))
+        return Diagnosed(diagnose_without_table(source, options, provenance))
+    return Diagnosed(diagnose_recording(source, table, options, provenance=provenance))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -108,8 +108,7 @@ class Planned:
 def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = None, grade: str = 'industrial', imu_rate: float = 100.0,
          separate: Sequence[str] = (), diagnosis: str | PathLike | Mapping[str, Any] | None = None,
          around: Mapping[str, float] | None = None, reach: float | None = None, longest: float = LONGEST_SEPARATION,
-         progress: Callable[[float], None] | None = None, with_bound: bool = True,
-         **choices: Any) -> Planned:
+         with_bound: bool = True, **choices: Any) -> Planned:
     """
     Plan the motions that bring every parameter within its tolerance.
 
@@ -133,8 +132,6 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
         Degrees to either side; prismatic joints do not move.
     longest : float
         Longest duration of a plan that separates effects, s.
-    progress : callable, optional
-        Called with the completed fraction.
     with_bound : bool
         Whether the lower bound on the time is computed; a plan well above it is searched a second time.
     choices
@@ -168,7 +165,7 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
         provenance['warnings'] = '; '.join(warnings)
     if causes:
         provenance['tells_apart'] = ', '.join(causes)
-    return Planned(planner.plan(start, progress=progress, with_bound=with_bound, longest=longest if causes else np.inf), table, provenance)
+    return Planned(planner.plan(start, with_bound=with_bound, longest=longest if causes else np.inf), table, provenance)
 
 
 def _neighbourhood(limits, names, around, reach):

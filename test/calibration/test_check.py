@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.table_calibration import CheckResult, check_on_table
+from imu_calibration.calibration.table_calibration import CheckResult
 from imu_calibration.cli.main import main
 from imu_calibration.core.documents import to_text
 from imu_calibration.core.errors import InputError
@@ -53,12 +53,6 @@ def test_a_bias_that_moved_is_named(pair, calibrated):
 def test_the_recording_that_a_file_was_made_from_is_noticed(pair, calibrated):
     table = Table.from_mapping(pair.table)
     assert check(pair.first.block, calibrated.calibration, table).notes and not check(pair.second.block, calibrated.calibration, table).notes
-
-
-def test_progress_is_told_while_a_recording_is_read(pair, calibrated):
-    told = []
-    check_on_table([lambda: iter([pair.second.block])], Table.from_mapping(pair.table), calibrated.calibration, progress=told.append)
-    assert told and told[-1] == len(pair.second.imu)
 
 
 def test_nothing_to_judge_on_is_no_proof():

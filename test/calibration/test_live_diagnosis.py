@@ -15,6 +15,7 @@ from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.session import LiveSettings
 from imu_calibration.core.errors import DocumentError
+from imu_calibration.core.progress import report
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
@@ -201,10 +202,10 @@ class Slow:
         self.asked += 1
         return self
 
-    def answer(self, progress):
+    def answer(self):
         """Wait, look whether to go on, answer."""
         while not self.go.wait(0.01):
-            progress(0.5)
+            report('waiting', 0.5, 1.0)
         return Answer(DiagnosisState('found', self.words), Demand())
 
     @property
@@ -245,7 +246,7 @@ def test_a_failure_is_a_status_and_zero_is_off():
     class Broken:
         samples = 0
 
-        def answer(self, progress):
+        def answer(self):
             raise ValueError('broken')
     thread = DiagnosisThread(3600.0)
     thread.want()

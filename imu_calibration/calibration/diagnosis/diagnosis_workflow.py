@@ -86,7 +86,7 @@ class DiagnosisResult:
 
 
 def diagnose_recording(source: Callable, table: Table, options: CalibrationOptions = CalibrationOptions(), *,
-                       provenance: dict[str, Any] | None = None, progress: Callable | None = None) -> DiagnosisResult:
+                       provenance: dict[str, Any] | None = None) -> DiagnosisResult:
     """
     Calibrate a recording, identify the errors of the model and their causes, and extend it.
 
@@ -98,8 +98,6 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
     options : CalibrationOptions
         The initial model; default bias and matrix, so that every other effect is tested.
     provenance : dict, optional
-    progress : callable, optional
-        Called with the progress since the last call, percent.
 
     Returns
     -------
@@ -111,16 +109,13 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
     def read(step, numbered):
         return [step.read(source(), session, Preflight(table.gravity_value), windows=windows if not windows else None) for session,
                 source in numbered]
-    report = _percent(progress) if progress else None
-    calibrated = calibrate_by_evidence([source], table, replace(options, as_asked=False), provenance=provenance, asking=report, mapper=read)
+    calibrated = calibrate_by_evidence([source], table, replace(options, as_asked=False), provenance=provenance, mapper=read)
     if calibrated.found is None:
         raise too_few_windows(len(calibrated.result.gathered.spreads[0].windows))
     result, diagnosis = calibrated.result, told(table, calibrated.found, calibrated=calibrated.result.solution)
     proposed = _with_proposals(source, table, options, result, diagnosis, provenance)
     traces = residual_traces(windows, table, diagnosis.baseline, after=proposed or diagnosis.solution)
     diagnosis = replace(diagnosis, traces=traces)
-    if report:
-        report(1.0)
     return DiagnosisResult(diagnosis, result.calibration, result.tolerances, result.needed, result.observations, baseline_options(options),
                            proposed)
 
@@ -142,9 +137,8 @@ def _with_proposals(source, table, options, result, diagnosis, provenance):
     return conclude(unsure.applied(solution), gathered, gathered_model, table=table, options=chosen, provenance=provenance).calibration
 
 
-def diagnose_without_table(source: Callable, options: CalibrationOptions = CalibrationOptions(), provenance: dict[str, Any] | None = None,
-                           *,
-                           progress: Callable | None = None) -> DiagnosisResult:
+def diagnose_without_table(source: Callable, options: CalibrationOptions = CalibrationOptions(),
+                           provenance: dict[str, Any] | None = None) -> DiagnosisResult:
     """
     Calibrate a recording by hand, identify the errors of the model and their causes, and extend it (see `hand_diagnosis`).
 
@@ -154,7 +148,7 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
         Returns an iterator of SampleBlock.
     options : CalibrationOptions
         The initial model; default bias and matrix.
-    provenance, progress : optional
+    provenance : optional
         As in `diagnose_recording`.
 
     Returns
@@ -164,26 +158,13 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
     """
     preflight = Preflight(options.gravity)
     recording = read_by_hand(source(), options.nominal, [preflight])
-    report = _percent(progress) if progress else None
-    result, evident = evident_result(recording, replace(options, as_asked=False), provenance, findings=preflight.findings, progress=report)
+    result, evident = evident_result(recording, replace(options, as_asked=False), provenance, findings=preflight.findings)
     if evident.found is None:
         raise too_few_poses(len(evident.hand.poses.start))
-    if report:
-        report(1.0)
     return DiagnosisResult(told_by_hand(evident.found, evident.hand), result.calibration, result.tolerances, result.needed,
                            result.observations,
                            replace(options, accelerometer_model=options.accelerometer_model or BARE,
                                    gyroscope_model=options.gyroscope_model or BARE))
-
-
-def _percent(advance):
-    """Return a function of the share done that calls `advance` with the increment in percent."""
-    done = [0.0]
-
-    def report(share):
-        advance(100 * share - done[0])
-        done[0] = 100 * share
-    return report
 
 
 def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:

@@ -1,6 +1,6 @@
 """Diagnosis of a calibration by hand: the search on poses and turns, the residuals of the poses, and the places of other offsets."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -153,7 +153,7 @@ class HandDiagnosis:
     """The extended calibration; the baseline's without findings."""
 
 
-def diagnose_by_hand(data: HandData, options: HandOptions = HandOptions(), progress: Callable | None = None) -> HandDiagnosis:
+def diagnose_by_hand(data: HandData, options: HandOptions = HandOptions()) -> HandDiagnosis:
     """
     Diagnose the errors of a calibration by hand and their causes; arguments and errors as in `investigate_by_hand`.
 
@@ -162,12 +162,9 @@ def diagnose_by_hand(data: HandData, options: HandOptions = HandOptions(), progr
     HandDiagnosis
 
     """
-    found = investigate_by_hand(data, options, progress)
+    found = investigate_by_hand(data, options)
     hand = extended_by_hand(data, found, options)
-    result = told_by_hand(found, hand)
-    if progress:
-        progress(1.0)
-    return HandDiagnosis(result, hand)
+    return HandDiagnosis(told_by_hand(found, hand), hand)
 
 
 def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:

@@ -1,6 +1,5 @@
 """A diagnosis during the motion: its input, a solution, and its outcome as a status."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -72,10 +71,10 @@ class DiagnosisQuestion:
         """Numbers of samples: equal for two questions about the same ones."""
         return self.snapshot.gathered.accumulator.samples
 
-    def answer(self, progress: Callable[[float], object] | None = None) -> Answer:
-        """Diagnose and return the `Answer`; `progress` is called with the share done and may raise to end it."""
+    def answer(self) -> Answer:
+        """Diagnose and return the `Answer`; a listener of its progress (`core.progress`) may raise to end it."""
         try:
-            evidence = self.snapshot.evidence(progress)
+            evidence = self.snapshot.evidence()
             if evidence.found is None:
                 raise too_few_windows(sum(len(spread.windows) for spread in self.snapshot.gathered.spreads))
             calibrated = None if evidence.demand.changes.lacking else evidence.solution

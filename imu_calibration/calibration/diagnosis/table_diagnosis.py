@@ -1,6 +1,6 @@
 """From windows to findings: the function that tests every effect and describes the findings."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,8 +28,7 @@ HALF = 0.5
 """Share of a finding that an unnamed effect would replace, from which it is reported with the finding."""
 
 
-def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, progress: Callable | None = None,
-             bias_processes: dict | None = None) -> Diagnosis:
+def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, bias_processes: dict | None = None) -> Diagnosis:
     """
     Diagnose the errors of a model and their causes.
 
@@ -44,8 +43,6 @@ def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, pro
         The reference.
     model : SensorModel
         The model to diagnose.
-    progress : callable, optional
-        Called with the share that is done, in [0, 1].
     bias_processes : dict, optional
         Sensor -> its bias processes, where measured separately.
 
@@ -59,11 +56,8 @@ def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, pro
         When there are too few windows to hold any out.
 
     """
-    result = told(table, inquire(windows, table, model, progress=progress, bias_processes=bias_processes))
-    result = replace(result, traces=residual_traces(windows, table, result.baseline, after=result.solution))
-    if progress:
-        progress(1.0)
-    return result
+    result = told(table, inquire(windows, table, model, bias_processes=bias_processes))
+    return replace(result, traces=residual_traces(windows, table, result.baseline, after=result.solution))
 
 
 def told(table: Table, found: Investigation, *, calibrated: Solution | None = None) -> Diagnosis:

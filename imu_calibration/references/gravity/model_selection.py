@@ -1,11 +1,12 @@
 """Test of every effect on a recording by hand: the search of a diagnosis, on poses and turns instead of windows on a table."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from imu_calibration.core.errors import NotObservableError
+from imu_calibration.core.progress import reported
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.references.gravity.effect_rows import Block, HandSpace, build_rows
@@ -122,7 +123,7 @@ class HandInvestigation(Named):
         return _gain(self.inquiry, self.held_out, before, after, sensor)
 
 
-def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), progress: Callable | None = None) -> HandInvestigation:
+def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) -> HandInvestigation:
     """
     Test every effect that is observable by hand on held-out poses.
 
@@ -136,8 +137,6 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), pr
         From `gather_by_hand`.
     options : HandOptions
         Reference, tolerances, and the effects of the baseline: by default bias and matrix.
-    progress : callable, optional
-        Called with the completed share.
 
     Raises
     ------
@@ -145,7 +144,7 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), pr
         With too few poses to hold any out.
 
     """
-    report, poses = progress or (lambda share: None), data.poses
+    poses = data.poses
     if len(poses.start) < POSES_LEAST:
         raise too_few_poses(len(poses.start))
     baseline = solve_by_hand(data, replace(options, accelerometer=options.accelerometer or BASE, gyroscope=options.gyroscope or BASE))
@@ -153,13 +152,11 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions(), pr
     effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity))
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
-    report(0.1)
     base = tuple(range(baseline.model.size + 1))   # including fixed parameters and the Earth's rate: their uncertainty is no finding
     questions = _questions(effects, blocks, space, base, not_testable)
     inquiry = Inquiry(blocks, space, questions, baseline=base)
     named = inquiry.named()
-    report(0.3)
-    held_out = _held_out(inquiry, report) if named else []
+    held_out = _held_out(inquiry) if named else []
     named = _that_predict(inquiry, held_out, named)
     denied = [question for question in named if not inquiry.agrees_in_halves(named, question)]
     if denied:
@@ -225,15 +222,14 @@ def _questions(effects, blocks, space, base, not_testable):
     return asked
 
 
-def _held_out(inquiry, report):
+def _held_out(inquiry):
     """Return fold -> (poses, findings without them, evidence without them): the complete search, repeated."""
     poses = np.unique(np.concatenate([block.pose for block in inquiry.blocks]))
     found, times = [], min(OUTER, len(poses))
-    for number in range(times):
+    for number in reported('repeating the search', range(times), times):
         out = poses[number::times]
         smaller = inquiry.without(out)
         found.append((out, smaller.named(), smaller))
-        report(0.3 + 0.6 * (number + 1) / times)
     return found
 
 
