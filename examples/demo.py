@@ -8,6 +8,8 @@ import argparse
 import shutil
 from pathlib import Path
 
+from error_figures import before_and_after
+
 from imu_calibration.cli.main import main
 from imu_calibration.cli.show import console
 from imu_calibration.compensation import stream
@@ -35,7 +37,7 @@ def run(folder):
     verb('compensate', second, '--calibration', folder / 'calibration.yaml', '--output', folder / 'other_session_corrected')
     table, calibration = files.read_table(second / 'table.yaml'), files.read_calibration(folder / 'calibration.yaml')
     truth = stream.session_truth(source_of(second, joint_names=table.joint_names)(), table)
-    show(stream.before_and_after(truth, calibration))
+    show(before_and_after(truth, calibration))
     lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
     print('not determined by this recording: ' + (', '.join(lacking) if lacking else 'none; every parameter is within its tolerance'))
     print(f'report: {(folder / "report.html").resolve()}')

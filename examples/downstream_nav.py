@@ -25,10 +25,7 @@ from imu_calibration.compensation.health import StopDetector  # noqa: E402
 from imu_calibration.core.samples import ImuSamples  # noqa: E402
 from imu_calibration.document import files  # noqa: E402
 from imu_calibration.effects.forward_equations import sensor_output  # noqa: E402
-from imu_calibration.kinematics.rotations import (
-    Reference,  # noqa: E402
-    align,  # noqa: E402
-)
+from imu_calibration.kinematics.rotations import Reference, align  # noqa: E402
 from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
 from msg_adapters.imu_stream import ImuStream  # noqa: E402
 from msg_adapters.write import write_session  # noqa: E402

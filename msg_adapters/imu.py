@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,63 +26,10 @@ FIELDS = {'orientation': slice(0, 4), 'orientation_cov': slice(4, 13), 'rate_s':
           'force_s': slice(25, 28), 'force_cov': slice(28, 37)}
 """Positions in the 37 doubles after the header: x, y, z, w and row-major 3 x 3 covariances."""
 
-_DOUBLES = {order: struct.Struct(f'{order}{N_DOUBLES}d') for order in '<>'}
-
-
-class ImuMessage(NamedTuple):
-    """One parsed message."""
-
-    stamp_ns: int
-    """Header stamp."""
-    frame_id: str
-    """Frame of the readings."""
-    doubles: tuple
-    """All 37 numbers in the order of the message; `FIELDS` gives their positions."""
-
-
-def parse_imu(data: bytes) -> ImuMessage:
-    """
-    Parse a serialized Imu message.
-
-    Raises
-    ------
-    MessageError
-        When the bytes are not a plain CDR Imu message.
-
-    """
-    header, body = _open_message(data)
-    return ImuMessage(header.stamp_ns, header.frame_id, _DOUBLES[header.order].unpack_from(data, body))
-
-
-def patch_imu(data: bytes, frame_id: str | None = None, **fields: Sequence[float]) -> bytes:
-    """
-    Return a copy of a serialized Imu message with some fields replaced.
-
-    Parameters
-    ----------
-    data : bytes
-        The message; its stamp and every field that is not named are copied bit by bit.
-    frame_id : str, optional
-        New frame.
-    fields : array_like
-        Values by the names of `FIELDS`; covariances as 3 x 3 or as nine numbers.
-
-    """
-    header, body = _open_message(data)
-    order = header.order
-    if frame_id is not None and frame_id.encode() != header.frame:
-        data, body = _reframed(data, order, body, frame_id.encode())
-    patched = bytearray(data)
-    for name, value in fields.items():
-        value = np.asarray(value, dtype=float).ravel()
-        place = FIELDS[name]
-        struct.pack_into(f'{order}{place.stop - place.start}d', patched, body + 8 * place.start, *value)
-    return bytes(patched)
-
 
 def find_imu_layout(data: bytes) -> MessageLayout:
     """Return the MessageLayout of a serialized Imu message (raises MessageError)."""
-    header, body = _open_message(data)
+    header, body = open_message(data)
     offsets = {name: (body + 8 * place.start, place.stop - place.start) for name, place in FIELDS.items()}
     fixed = ((0, 2), (FRAME_OFFSET, header.end))
     return MessageLayout(header.order, len(data), bytes(data), fixed, offsets, (header.frame_id,))
@@ -102,7 +49,7 @@ def decode_imu(layout: MessageLayout, packed: Packed) -> ImuSamples:
 
 def patch_imu_group(layout: MessageLayout, packed: Packed, fields: dict[str, np.ndarray], *, frame_id: str | None = None) -> np.ndarray:
     """
-    Return copies of messages of one layout with some fields replaced (see `patch_imu` for one message).
+    Return copies of messages of one layout with some fields replaced.
 
     Parameters
     ----------
@@ -126,7 +73,7 @@ def patch_imu_group(layout: MessageLayout, packed: Packed, fields: dict[str, np.
     if frame_id is None or frame_id == layout.names[0]:
         return table
     body = layout.offsets['orientation'][0]
-    sample, new_body = _reframed(layout.sample, layout.order, body, frame_id.encode())
+    sample, new_body = reframed(layout.sample, layout.order, body, frame_id.encode())
     head = np.broadcast_to(np.frombuffer(sample[FRAME_OFFSET:new_body], np.uint8), (len(table), new_body - FRAME_OFFSET))
     return np.concatenate([table[:, :FRAME_OFFSET], head, table[:, body:]], axis=1)
 
@@ -148,7 +95,7 @@ def _reading(vector, covariance):
     return (np.nan,) * 3 if covariance[0] == -1.0 else (float(vector.x), float(vector.y), float(vector.z))
 
 
-def _open_message(data):
+def open_message(data):
     """Check the bytes and return (Header, offset of the doubles)."""
     header = open_header(data)
     body = aligned(header.end, 8)
@@ -157,7 +104,7 @@ def _open_message(data):
     return header, body
 
 
-def _reframed(data, order, body, frame):
+def reframed(data, order, body, frame):
     """Return the message with another frame_id and the new offset of its doubles."""
     new_body = aligned(FRAME_OFFSET + 4 + len(frame) + 1, 8)
     head = bytes(data[:FRAME_OFFSET]) + struct.pack(order + 'I', len(frame) + 1) + frame + b'\0'

@@ -16,9 +16,10 @@ from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.compensation.compensate import Transfer, compensate
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from msg_adapters.bag import open_recording
-from msg_adapters.imu import FIELDS, parse_imu
+from msg_adapters.imu import FIELDS
 from msg_adapters.write import encode_imu
 from validation.figures import new_figure
+from validation.imu_messages import parse_imu
 from validation.recordings import load
 from validation.section import Section, text
 

@@ -74,10 +74,6 @@ class HandResult(CalibrationResult):
         """Empty: the directions of the poses are estimated too."""
         return np.zeros(0)
 
-    def first_rest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean specific force and rate of the first pose, each shape (3,)."""
-        return self.hand.poses.force[0], self.hand.poses.rate[0]
-
     def window_errors(self) -> WindowErrors:
         """Return the errors of the poses, after: held out; relative to gravity along its estimated direction, and to zero rate."""
         hand, poses = self.hand, self.hand.poses

@@ -112,10 +112,6 @@ class CalibrationResult(ABC):
         """Singular values of the design in units of the tolerances, descending; none where they are not known."""
 
     @abstractmethod
-    def first_rest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean specific force and rate of the first pose at rest, each shape (3,)."""
-
-    @abstractmethod
     def window_errors(self) -> WindowErrors:
         """Return the errors of window means before and after."""
 

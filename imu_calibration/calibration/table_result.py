@@ -259,11 +259,6 @@ class TableResult(CalibrationResult):
         values = tolerance_scaled_singular_values(self.solution.information + convention.T @ convention, self.tolerances)
         return values[len(convention):]
 
-    def first_rest(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean specific force and rate of the first window, each shape (3,)."""
-        row = self.gathered.accumulator.rows[0]
-        return row.sensors['accelerometer'].mean[-3:], row.sensors['gyroscope'].mean[-3:]
-
     def window_errors(self) -> WindowErrors:
         """Return the errors of window means before and after, against the table; after: predicted without the fold of the window."""
         held_out = self.gathered.held_out if self.gathered.held_out.n_windows else HeldOut([HeldOutBlock(self.gathered.accumulator)])

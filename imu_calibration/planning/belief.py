@@ -34,17 +34,13 @@ class Relaxation:
 
     seconds: float
     """Lower bound on the time of every plan, s."""
-    visits: np.ndarray
-    """How often the relaxed plan visits each motion, shape (k,)."""
-    prices: np.ndarray
-    """Matrix X: value of a unit of information, s, shape (n, n)."""
     relaxed_seconds: float
     """Time of the relaxed plan, s; the value of the programme lies between this and the bound."""
     weights: np.ndarray
     """How much each parameter limits the relaxed plan, sum 1, shape (p,)."""
 
 
-def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, asked: np.ndarray, rounds: int = ROUNDS) -> Relaxation:
+def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, asked: np.ndarray) -> Relaxation:
     """
     Return the relaxed plan with the best certificate found; NaN where a tolerance is out of reach.
 
@@ -65,21 +61,21 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
     """
     weights = np.full(len(asked), 1.0 / len(asked))
     if _worst(known, asked) <= 1.0:
-        return Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), 0.0, weights)
+        return Relaxation(0.0, 0.0, weights)
     if _worst(known + LONGEST * np.sum(information / seconds[:, None, None], axis=0), asked) > 1.0:
-        return Relaxation(np.nan, np.full(len(seconds), np.nan), np.full_like(known, np.nan), np.nan, weights)
+        return Relaxation(np.nan, np.nan, weights)
     kept = np.arange(len(seconds))
     flat = information.reshape(len(seconds), -1)
     share = np.full(len(seconds), 1.0 / len(seconds)) / seconds
-    best = Relaxation(0.0, np.zeros(len(seconds)), np.zeros_like(known), np.inf, weights)
-    for number in range(rounds):
+    best = Relaxation(0.0, np.inf, weights)
+    for number in range(ROUNDS):
         total, scale = _scaled(np.tensordot(share[kept], flat[kept], 1).reshape(known.shape), known, asked)
         covariance = inverse_normal(total)   # nearly singular in unreachable directions
         x = covariance @ asked.T
         variance = np.einsum('pn,np->p', asked, x)
         prices = (x * weights) @ x.T
         worth = np.zeros(len(seconds))
-        full = number % 25 == 0 or number == rounds - 1
+        full = number % 25 == 0 or number == ROUNDS - 1
         used = np.arange(len(seconds)) if full else kept
         worth[used] = flat[used] @ prices.ravel() / seconds[used]
         relaxed = scale * float(share @ seconds)
@@ -87,7 +83,7 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
             factor = 1.0 / worth.max()
             bound = factor * (weights @ (2 * variance - 1) - np.sum(known * prices))
             if bound > best.seconds:
-                best = Relaxation(float(bound), scale * share, factor * prices, relaxed, weights)
+                best = Relaxation(float(bound), relaxed, weights)
             if relaxed < CLOSE * best.seconds:
                 break
             kept = np.flatnonzero((worth > 0.3 * worth.max()) | (share * seconds > 1e-4 * (share @ seconds)))

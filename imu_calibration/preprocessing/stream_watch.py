@@ -81,11 +81,6 @@ class StreamWatch:
         """Arrival time of the last message, s of the clock given to `note`; None before the first."""
         return max(self._arrived.values(), default=None)
 
-    @property
-    def n_imu(self) -> int:
-        """Number of IMU samples."""
-        return self._count['imu']
-
     def note(self, block: SampleBlock, now: float) -> None:
         """Process a SampleBlock that arrived at `now`, s of a steady clock."""
         for reason, count in (block.notes or {}).items():

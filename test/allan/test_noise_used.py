@@ -30,7 +30,8 @@ from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.adoption import CompensatorSettings, adopt
 from imu_calibration.references.options import CalibrationOptions
-from msg_adapters.imu import FIELDS, parse_imu
+from msg_adapters.imu import FIELDS
+from validation.imu_messages import parse_imu
 
 from worlds import physics
 from worlds.compensation_cases import random_calibration

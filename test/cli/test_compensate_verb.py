@@ -16,8 +16,9 @@ from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.signal_history import ThermalBranch
 from msg_adapters.bag import open_recording
-from msg_adapters.imu import FIELDS, parse_imu
+from msg_adapters.imu import FIELDS
 from msg_adapters.write import write_session
+from validation.imu_messages import parse_imu
 
 from worlds.compensation_cases import FURTHER, random_calibration
 

@@ -15,8 +15,9 @@ from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.nodes.message_compensation import LiveCompensation
-from msg_adapters.imu import FIELDS, N_DOUBLES, parse_imu, patch_imu
+from msg_adapters.imu import FIELDS, N_DOUBLES
 from msg_adapters.write import encode_imu
+from validation.imu_messages import parse_imu, patch_imu
 
 from worlds.compensation_cases import random_calibration, random_motion
 

@@ -13,8 +13,9 @@ from imu_calibration.compensation.stream import CompensationStream, derivative_f
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.preprocessing.stamping import COUNTED, IRREGULAR, REGULAR, describe_stamps
-from msg_adapters.imu import FIELDS, parse_imu, patch_imu
+from msg_adapters.imu import FIELDS
 from msg_adapters.write import encode_imu
+from validation.imu_messages import parse_imu, patch_imu
 
 from worlds.compensation_cases import random_calibration
 

@@ -18,8 +18,9 @@ from imu_calibration.document import trust
 from imu_calibration.document.calibration_text import calibration_to_text, checked_tolerances, from_mapping, to_mapping
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.message_compensation import LiveCompensation
-from msg_adapters.imu import FIELDS, parse_imu
+from msg_adapters.imu import FIELDS
 from msg_adapters.write import encode_imu
+from validation.imu_messages import parse_imu
 
 from worlds.compensation_cases import random_calibration
 

@@ -158,8 +158,9 @@ INVERTED = ('gyro_anisoelasticity', 'accel_triple_product')
 
 def test_compensation_takes_it_out_offline_and_live():
     from imu_calibration.nodes.message_compensation import LiveCompensation
-    from msg_adapters.imu import FIELDS, parse_imu
+    from msg_adapters.imu import FIELDS
     from msg_adapters.write import encode_imu
+    from validation.imu_messages import parse_imu
     truth = replace(session(*INVERTED).truth, frame_id='')
     ref = motion(400)
     model, values = truth.model, truth.values

@@ -12,7 +12,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.definitions import deserializer, is_standard, standard_definition
-from msg_adapters.imu import FIELDS, IMU_TYPE, TEMPERATURE_TYPE, parse_imu, patch_imu
+from msg_adapters.imu import FIELDS, IMU_TYPE, TEMPERATURE_TYPE
 from msg_adapters.joint_state import (
     JOINT_STATE_TYPE,
     JOINT_TRAJECTORY_TYPE,
@@ -24,6 +24,7 @@ from msg_adapters.joint_state import (
 from msg_adapters.layout import LONGEST_NAME, MAX_LAYOUTS, MessageError, Packed, clean_name
 from msg_adapters.live import LiveGatherer
 from msg_adapters.write import encode_imu, encode_joints, encode_temperature
+from validation.imu_messages import parse_imu, patch_imu
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types

@@ -10,8 +10,9 @@ from test_adapters_bag import make_session
 
 from imu_calibration.core.errors import InputError
 from msg_adapters.copying import copy_with_corrected
-from msg_adapters.imu import FIELDS, parse_imu, patch_imu
+from msg_adapters.imu import FIELDS
 from msg_adapters.write import write_session
+from validation.imu_messages import parse_imu, patch_imu
 
 
 def raw_messages(path, topic):

@@ -13,8 +13,9 @@ from imu_calibration.core.documents import version_of
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.nodes.message_compensation import LiveCompensation
-from msg_adapters.imu import FIELDS, parse_imu, patch_imu
+from msg_adapters.imu import FIELDS
 from msg_adapters.write import encode_imu
+from validation.imu_messages import parse_imu, patch_imu
 
 from ros.harness import Harness
 from ros.live_station import free_domain
