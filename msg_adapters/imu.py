@@ -9,6 +9,7 @@ import numpy as np
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from msg_adapters.layout import (
     FRAME_OFFSET,
+    Header,
     MessageError,
     MessageLayout,
     Packed,
@@ -73,7 +74,7 @@ def patch_imu_group(layout: MessageLayout, packed: Packed, fields: dict[str, np.
     if frame_id is None or frame_id == layout.names[0]:
         return table
     body = layout.offsets['orientation'][0]
-    sample, new_body = reframed(layout.sample, layout.order, body, frame_id.encode())
+    sample, new_body = reframed(layout.sample, layout.order, body, frame=frame_id.encode())
     head = np.broadcast_to(np.frombuffer(sample[FRAME_OFFSET:new_body], np.uint8), (len(table), new_body - FRAME_OFFSET))
     return np.concatenate([table[:, :FRAME_OFFSET], head, table[:, body:]], axis=1)
 
@@ -95,7 +96,7 @@ def _reading(vector, covariance):
     return (np.nan,) * 3 if covariance[0] == -1.0 else (float(vector.x), float(vector.y), float(vector.z))
 
 
-def open_message(data):
+def open_message(data: bytes) -> tuple[Header, int]:
     """Check the bytes and return (Header, offset of the doubles)."""
     header = open_header(data)
     body = aligned(header.end, 8)
@@ -104,7 +105,7 @@ def open_message(data):
     return header, body
 
 
-def reframed(data, order, body, frame):
+def reframed(data: bytes, order: str, body: int, *, frame: bytes) -> tuple[bytes, int]:
     """Return the message with another frame_id and the new offset of its doubles."""
     new_body = aligned(FRAME_OFFSET + 4 + len(frame) + 1, 8)
     head = bytes(data[:FRAME_OFFSET]) + struct.pack(order + 'I', len(frame) + 1) + frame + b'\0'

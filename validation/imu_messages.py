@@ -51,7 +51,7 @@ def patch_imu(data: bytes, frame_id: str | None = None, **fields: Sequence[float
     header, body = open_message(data)
     order = header.order
     if frame_id is not None and frame_id.encode() != header.frame:
-        data, body = reframed(data, order, body, frame_id.encode())
+        data, body = reframed(data, order, body, frame=frame_id.encode())
     patched = bytearray(data)
     for name, value in fields.items():
         value = np.asarray(value, dtype=float).ravel()

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from catkin_pkg.package import parse_package
 from refusal import refused
 
 import imu_calibration
+from imu_calibration.cli.parser import VERBS
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.use_cases import choices
@@ -245,3 +247,12 @@ def test_the_tolerances_file_covers_the_catalogue_with_its_defaults():
     flat = {(sensor, name): value for sensor, group in listed.items() for name, value in group.items()}
     declared = {(effect.sensor, effect.name): effect.tolerance for effect in CATALOGUE.effects().values()}
     assert flat == pytest.approx(declared, rel=1e-5)
+
+
+def test_the_map_has_each_verb_and_functions_that_exist():
+    rows = [line.split(' | ') for line in (ROOT / 'CONTRIBUTING.md').read_text().split('## Map')[1].split('## ')[0].splitlines() if line.startswith('| ')]
+    verbs = {verb for row in rows[2:] for verb in row[0].strip('| ').split(', ')} - {'table', 'by hand'}
+    assert verbs == set(VERBS)
+    for name in re.findall(r'`([a-z_.0-9]+\.\w+)`', ''.join(row[1] for row in rows[2:])):
+        module, _, function = name.rpartition('.')
+        assert callable(getattr(import_module(module if module.startswith('msg_adapters') else f'imu_calibration.{module}'), function)), name
