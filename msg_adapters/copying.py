@@ -20,7 +20,7 @@ from msg_adapters.write import rows
 
 def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike[str], imu_topic: str, *, corrected_topic: str,
                         correct: Callable, propagate: Callable | None = None, frame_id: str | None = None,
-                        mat_ts: np.ndarray | None = None, late_ns: int = 0, storage: str | None = None,
+                        mat_ts: np.ndarray | None = None, late_ns: int = 0,
                         source_frame_id: str | None = None) -> dict[str, int]:
     """
     Write a bag with all topics of another one and each corrected Imu message after the measured one.
@@ -44,8 +44,6 @@ def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike
         New frame of the corrected messages; `mat_ts` (target from sensor) then turns the orientation.
     late_ns : int
         Subtracted from the stamps of the corrected messages.
-    storage : str, optional
-        'sqlite3' or 'mcap'; default as the source.
     source_frame_id : str, optional
         Frame of the messages that are corrected; see `msg_adapters.bag.open_recording`.
 
@@ -66,7 +64,7 @@ def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike
         topics = [topic.name for topic in recording.topics]
         choice = FrameChoice(recording.imu_topic, source_frame_id)
         patch = _Patch(correct, propagate, frame_id, mat_ts, late_ns, choice)
-        with BagWriter(destination, storage or bag.storage) as writer:
+        with BagWriter(destination, bag.storage) as writer:
             ids = np.array([writer.add_topic(name, bag.definition(name), bag.qos(name)) for name in topics])
             corrected_id = writer.add_topic(corrected_topic, standard_definition(IMU_TYPE))
             for raw in bag.raw_stretches(topics):

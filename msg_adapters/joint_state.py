@@ -137,21 +137,11 @@ JOINT_TRAJECTORY_TYPE = 'trajectory_msgs/msg/JointTrajectory'
 _FIELDS = {'position': 'positions', 'rate': 'velocities', 'acceleration': 'accelerations'}
 
 
-def encode_trajectory(points: TrajectoryPoints, frame_id: str = '', stamp_ns: int = 0) -> bytes:
-    """
-    Return TrajectoryPoints as plain little-endian CDR.
-
-    Parameters
-    ----------
-    points : TrajectoryPoints
-    frame_id : str
-    stamp_ns : int
-        When the trajectory begins; 0: when it arrives.
-
-    """
+def encode_trajectory(points: TrajectoryPoints) -> bytes:
+    """Return TrajectoryPoints as plain little-endian CDR, without a frame, to begin at their arrival."""
     writer = _Writer()
-    writer.numbers('iI', *divmod(stamp_ns, NS_PER_S))
-    writer.string(frame_id)
+    writer.numbers('iI', 0, 0)
+    writer.string('')
     writer.numbers('I', len(points.joint_names))
     for name in points.joint_names:
         writer.string(name)

@@ -148,7 +148,7 @@ def write_session(path: str | PathLike[str], imu: ImuSamples, joints: JointSampl
             _write_batch(bag, ids, received, [(samples, encode) for _, _, samples, encode in streams], parts)
 
 
-def write_trajectories(path: str | PathLike[str], parts: Sequence[tuple[int, TrajectoryPoints]], *, topic: str = 'joint_trajectory',
+def write_trajectories(path: str | PathLike[str], parts: Sequence[tuple[int, TrajectoryPoints]], *,
                        storage: str = 'sqlite3') -> None:
     """
     Write joint trajectories into a new bag, each at the time (ns) at which it shall begin: played back, it drives the joints.
@@ -160,7 +160,7 @@ def write_trajectories(path: str | PathLike[str], parts: Sequence[tuple[int, Tra
 
     """
     with BagWriter(path, storage) as bag:
-        number = bag.add_topic(topic, standard_definition(JOINT_TRAJECTORY_TYPE))
+        number = bag.add_topic('joint_trajectory', standard_definition(JOINT_TRAJECTORY_TYPE))
         messages = [memoryview(encode_trajectory(points)) for _, points in parts]
         bag.write(np.full(len(parts), number), np.array([stamp for stamp, _ in parts], np.int64), messages)
 

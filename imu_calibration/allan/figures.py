@@ -1,6 +1,5 @@
 """The noise figures of an IMU, and the parameters of filters from them: discrete noise, and Gauss-Markov processes for the slow part."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -122,11 +121,11 @@ class NoiseFigures:
         """Return the axes of 'accelerometer' or 'gyroscope'."""
         return {'accelerometer': self.accelerometer, 'gyroscope': self.gyroscope}[name]
 
-    def densities(self, sensor: str, horizon: float = HORIZON, worst: Callable = max) -> 'Densities':
+    def densities(self, sensor: str, horizon: float = HORIZON) -> 'Densities':
         """Return the two noise parameters of most filters for a sensor: its worst axis with a finite figure."""
         walks = [axis.walk(horizon) for axis in self.sensor(sensor)]
-        walk, basis = worst([found for found in walks if np.isfinite(found[0])] or walks)
-        return Densities(float(worst(axis.white for axis in self.sensor(sensor))), float(walk), basis)
+        walk, basis = max([found for found in walks if np.isfinite(found[0])] or walks)
+        return Densities(float(max(axis.white for axis in self.sensor(sensor))), float(walk), basis)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from imu_calibration.calibration.hand_proof import (
     turn_error,
     uncorrected_by_hand,
 )
-from imu_calibration.calibration.result import CalibrationResult, ErrorBudget, ReferenceErrors, WindowErrors
+from imu_calibration.calibration.result import GRAVITY_SD, CalibrationResult, ErrorBudget, WindowErrors
 from imu_calibration.calibration.table_calibration import CheckResult
 from imu_calibration.compensation.stream import compensate_readings
 from imu_calibration.core.errors import InputError, NotObservableError
@@ -95,10 +95,10 @@ class HandResult(CalibrationResult):
         """Empty: by hand no windows are stored."""
         return {}
 
-    def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
+    def error_budget(self) -> ErrorBudget:
         """Return noise and gravity, the only reference. The sds contain the uncertainty of a gravity that was not given."""
         model, values, known = self.calibration.model, self.calibration.values, self.options.gravity is not None
-        relative = self.calibration.common_scale.get('sd', errors.gravity / self.gravity)
+        relative = self.calibration.common_scale.get('sd', GRAVITY_SD / self.gravity)
         part, gravity, gravity_sd = model.part('accelerometer', Role.LINEAR), np.zeros(len(values)), relative * self.gravity
         gravity[part] = np.abs(values[part]) * relative
         return ErrorBudget(tuple(model.param_names), {'noise': self.calibration.own_sd, 'gravity': gravity},

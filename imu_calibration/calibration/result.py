@@ -6,8 +6,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from imu_calibration.core.settings import setting
-from imu_calibration.core.units import ARCMIN
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import HELPS, Verdict, most_cautious
 from imu_calibration.document.trust import usage
@@ -15,6 +13,9 @@ from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.gathered import Gathered
+
+GRAVITY_SD = 5e-4
+"""Standard deviation of the local gravity where a table description or the options give it without one, m/s^2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,19 +36,6 @@ class WindowErrors:
     """Sensor -> error of the mean corrected with parameters that were estimated without the window, shape (n, 3)."""
     floor: dict
     """Sensor -> sd of the mean from noise, shape (n, 3)."""
-
-
-@dataclass(frozen=True)
-class ReferenceErrors:
-    """Standard deviations of the parts of the reference."""
-
-    levelling: float = setting(2 * ARCMIN, 'rad', 'levelling of the table, each of two directions; counts when table_tilt is not estimated',
-                               (0.0, 0.1))
-    joint_position: float = setting(10 * ARCMIN / 60, 'rad', 'position of each joint, independent in every window', (0.0, 0.1))
-    rate: float = setting(1e-4, '1', 'relative error of the table rate (its clock), common to all windows', (0.0, 0.1))
-    gravity: float = setting(5e-4, 'm/s^2',
-                             'local gravity, if the table description gives gravity without gravity_sd',
-                             (0.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +108,7 @@ class CalibrationResult(ABC):
         """Return sensor -> measured minus predicted of a window that was kept, shape (n, 3)."""
 
     @abstractmethod
-    def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
+    def error_budget(self) -> ErrorBudget:
         """Return the standard deviation of each parameter by cause."""
 
 

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from imu_calibration.calibration.proof import nominal_values
-from imu_calibration.calibration.result import CalibrationResult, ErrorBudget, ReferenceErrors, WindowErrors
+from imu_calibration.calibration.result import GRAVITY_SD, CalibrationResult, ErrorBudget, WindowErrors
 from imu_calibration.core.units import ARCMIN
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import (
@@ -38,6 +38,12 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.gathered import HeldOut, HeldOutBlock
 
+LEVELLING_SD = 2 * ARCMIN
+"""Levelling of the table in each of two directions, rad; counts when table_tilt is not estimated."""
+JOINT_POSITION_SD = 10 * ARCMIN / 60
+"""Position of each joint, independent in every window, rad."""
+TABLE_RATE_SD = 1e-4
+"""Relative error of the table rate (its clock), common to all windows."""
 MOVING_SAMPLES = 20_000
 """Most samples of moving windows that are used; they are subsampled evenly beyond it."""
 
@@ -46,7 +52,7 @@ MOVING_SAMPLES = 20_000
 
 
 
-def error_budget(result: 'TableResult', errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
+def error_budget(result: 'TableResult') -> ErrorBudget:
     """
     Return the ErrorBudget of a calibration on a table.
 
@@ -56,13 +62,12 @@ def error_budget(result: 'TableResult', errors: ReferenceErrors = ReferenceError
     Parameters
     ----------
     result : TableResult
-    errors : ReferenceErrors
 
     """
     table = result.table
-    gravity_sd = errors.gravity if table.gravity is not None and table.gravity_sd is None else table.gravity_sd_value
+    gravity_sd = GRAVITY_SD if table.gravity is not None and table.gravity_sd is None else table.gravity_sd_value
     causes, texts = {'noise': result.solution.sd}, {'noise': 'noise and wander of the sensors, as this recording shows them'}
-    declared = _causes(result, errors, gravity_sd)
+    declared = _causes(result, gravity_sd)
     shifts = parameter_shifts(result, [change for _, _, _, changes in declared for change in changes])
     start = 0
     for name, text, scattered, changes in declared:
@@ -73,15 +78,15 @@ def error_budget(result: 'TableResult', errors: ReferenceErrors = ReferenceError
     return ErrorBudget(tuple(result.solution.param_names), causes, texts)
 
 
-def _causes(result, errors, gravity_sd):
+def _causes(result, gravity_sd):
     """Return (name, text, scattered, changes); a change maps (table, motion) to values that differ by one sd."""
     found = []
     if result.solution.model.find('reference', Role.TILT) is None:
-        text = f'levelling {errors.levelling / ARCMIN:.2g} arcmin in each direction, not estimated'
-        found.append(('levelling', text, False, [_Tilted(errors.levelling * np.eye(2)[k]) for k in range(2)]))
-    text = f'joint positions {errors.joint_position / ARCMIN * 60:.2g} arcsec, independent in every window'
-    found.append(('joint position', text, True, [_Turned(errors.joint_position, k) for k in range(len(result.table.joints))]))
-    found.append(('table rate', f'rate wrong by {errors.rate:.2g} of itself in all windows', False, [_Faster(errors.rate)]))
+        text = f'levelling {LEVELLING_SD / ARCMIN:.2g} arcmin in each direction, not estimated'
+        found.append(('levelling', text, False, [_Tilted(LEVELLING_SD * np.eye(2)[k]) for k in range(2)]))
+    text = f'joint positions {JOINT_POSITION_SD / ARCMIN * 60:.2g} arcsec, independent in every window'
+    found.append(('joint position', text, True, [_Turned(JOINT_POSITION_SD, k) for k in range(len(result.table.joints))]))
+    found.append(('table rate', f'rate wrong by {TABLE_RATE_SD:.2g} of itself in all windows', False, [_Faster(TABLE_RATE_SD)]))
     found.append(('gravity', f'gravity known to {gravity_sd:.2g} m/s²', False, [_Heavier(gravity_sd)]))
     return found
 
@@ -284,9 +289,9 @@ class TableResult(CalibrationResult):
         return {sensor: measured - model for sensor, measured,
                 model in zip(SENSORS, (window.force_s, window.rate_s), predicted, strict=True)}
 
-    def error_budget(self, errors: ReferenceErrors = ReferenceErrors()) -> ErrorBudget:
+    def error_budget(self) -> ErrorBudget:
         """Return the contributions of the noise and of the table."""
-        return error_budget(self, errors)
+        return error_budget(self)
 
 
 LONGEST = 1024

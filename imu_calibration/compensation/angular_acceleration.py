@@ -37,7 +37,11 @@ class CausalDerivative:
         return rate_sd * np.sqrt(12.0 / (self.taps * (self.taps**2 - 1.0))) / self.period
 
 
-def choose_derivative(period: float, rate_sd: float, arm: float, *, force_sd: float, largest_delay: float = 0.02) -> CausalDerivative:
+LARGEST_DELAY = 0.02
+"""The window of a derivative does not grow beyond this delay, s."""
+
+
+def choose_derivative(period: float, rate_sd: float, arm: float, *, force_sd: float) -> CausalDerivative:
     """
     Return the shortest window whose noise, through the arm, is below a third of the accelerometer's noise.
 
@@ -49,11 +53,9 @@ def choose_derivative(period: float, rate_sd: float, arm: float, *, force_sd: fl
         Noise of single samples, rad/s and m/s^2; when one is unknown (zero) the window has half the largest delay.
     arm : float
         Longest corrected lever arm, m.
-    largest_delay : float
-        The window does not grow beyond this delay, s.
 
     """
-    longest = max(2, int(2 * largest_delay / period) + 1)
+    longest = max(2, int(2 * LARGEST_DELAY / period) + 1)
     if not (rate_sd > 0 and force_sd > 0):
         return CausalDerivative((longest + 2) // 2, period)
     for taps in range(2, longest + 1):

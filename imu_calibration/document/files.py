@@ -85,9 +85,9 @@ def read_tolerances(path: Path, catalogue: Catalogue = CATALOGUE) -> dict[str, d
     return read_mapping(path, 'tolerance file', lambda mapping: checked_tolerances(mapping, catalogue))
 
 
-def read_effects(path: str | PathLike[str], catalogue: Catalogue = CATALOGUE) -> Catalogue:
+def read_effects(path: str | PathLike[str]) -> Catalogue:
     """Return the catalogue with the effects that a YAML file defines, a file of effects or a calibration."""
-    return read_mapping(path, 'file of effects', catalogue.with_document)
+    return read_mapping(path, 'file of effects', CATALOGUE.with_document)
 
 
 def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False) -> str:

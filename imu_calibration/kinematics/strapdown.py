@@ -284,8 +284,7 @@ def largest(vectors: np.ndarray) -> np.ndarray | float:
     return np.max(np.linalg.norm(vectors, axis=-1), axis=-1)
 
 
-def drift_over(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *, seconds: float = 50.0,
-               earth_rate_n: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Drift:
+def drift_over(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *, seconds: float = 50.0) -> Drift:
     """
     Return the dead-reckoning error of measured or compensated samples over stretches of a recording.
 
@@ -300,8 +299,6 @@ def drift_over(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *,
         Samples to judge, m/s^2 and rad/s.
     seconds : float
         Length of a stretch; stretches follow one another without overlap.
-    earth_rate_n : array, shape (3,)
-        Must match the content of `reference.rate_s`.
 
     Returns
     -------
@@ -321,10 +318,8 @@ def drift_over(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *,
     for first, last in zip(edges[:-1], edges[1:] + 1):
         cut = slice(first, last)
         start = reference.mat_sn[first].T
-        measured = strapdown(reference.time[cut], force_s[cut], rate_s[cut], gravity=reference.gravity, mat_ns0=start,
-                             earth_rate_n=earth_rate_n)
-        true = strapdown(reference.time[cut], reference.force_s[cut], reference.rate_s[cut], gravity=reference.gravity, mat_ns0=start,
-                         earth_rate_n=earth_rate_n)
+        measured = strapdown(reference.time[cut], force_s[cut], rate_s[cut], gravity=reference.gravity, mat_ns0=start)
+        true = strapdown(reference.time[cut], reference.force_s[cut], reference.rate_s[cut], gravity=reference.gravity, mat_ns0=start)
         ends.append((np.linalg.norm(measured.velocity_n[-1] - true.velocity_n[-1]),
                      np.linalg.norm(measured.position_n[-1] - true.position_n[-1]),
                      Rotation.from_matrix(measured.mat_ns[-1] @ true.mat_ns[-1].T).magnitude()))

@@ -145,6 +145,10 @@ class PlannedWindow:
     """Information of the samples about their means, of both sensors together, shape (n, n)."""
 
 
+WINDOW_SETTINGS = WindowSettings()
+"""How the calibration will cut windows."""
+
+
 class WindowPredictor:
     """
     Works out windows of planned motions from the columns of the model.
@@ -158,14 +162,11 @@ class WindowPredictor:
         Sensor -> NoiseModel of single samples.
     rate : float
         Samples per second.
-    settings : WindowSettings
-        How the calibration will cut windows.
 
     """
 
-    def __init__(self, table: Table, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float,
-                 settings: WindowSettings = WindowSettings()):
-        self.table, self.coordinates, self.noise, self.rate, self.settings = table, coordinates, noise, rate, settings
+    def __init__(self, table: Table, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float):
+        self.table, self.coordinates, self.noise, self.rate = table, coordinates, noise, rate
 
     def predict(self, motions: Sequence[tuple[Segment, ...]]) -> list[list[PlannedWindow]]:
         """Return the windows of each of several motions, a tuple of segments each."""
@@ -190,9 +191,9 @@ class WindowPredictor:
         begin = 0.0
         for segment in segments:
             kind = WINDOWS.get(segment.kind, 'dynamic')
-            lost = 0.0 if kind == 'dynamic' else self.settings.settling
+            lost = 0.0 if kind == 'dynamic' else WINDOW_SETTINGS.settling
             seconds = segment.duration - lost
-            if seconds >= getattr(self.settings, f'{kind}_minimum'):
+            if seconds >= getattr(WINDOW_SETTINGS, f'{kind}_minimum'):
                 count = LEAST_INSTANTS if kind == 'static' else max(int(np.ceil(seconds * SAMPLING)), LEAST_INSTANTS)
                 time = lost + (np.arange(count) + 0.5) / count * seconds
                 yield Profile('', (segment,)).at(time), kind, begin + lost + seconds / 2, segment.duration, seconds

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.result import ReferenceErrors
 from imu_calibration.calibration.table_calibration import calibrate
-from imu_calibration.calibration.table_result import _Faster, _Heavier, _Tilted, _Turned, error_budget, parameter_shifts
+from imu_calibration.calibration.table_result import JOINT_POSITION_SD, _Faster, _Heavier, _Tilted, _Turned, error_budget, parameter_shifts
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solver import solve
@@ -83,7 +82,7 @@ def test_a_fast_table_clock_scales_the_gyroscope_matrix_and_the_arms(result):
 def test_joint_errors_are_drawn_anew_in_every_window(result):
     """The sd of the budget is that of random joint errors put through the same shifts."""
     budget = error_budget(result)
-    changes = [_Turned(1.0 * ReferenceErrors().joint_position, k) for k in range(3)]
+    changes = [_Turned(1.0 * JOINT_POSITION_SD, k) for k in range(3)]
     shifts = parameter_shifts(result, changes)
     rng = np.random.default_rng(5)
     draws = np.einsum('dkw,kwp->dp', rng.normal(size=(4000, *shifts.shape[:2])), shifts)
@@ -101,8 +100,10 @@ def test_levelling_counts_only_where_tilt_is_not_estimated(recording, result):
     assert 'levelling' not in with_tilt.causes
 
 
-def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result):
-    small, large = (error_budget(result, replace(ReferenceErrors(), joint_position=size)) for size in (1e-5, 1e-4))
+def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result, monkeypatch):
+    small = error_budget(result)
+    monkeypatch.setattr('imu_calibration.calibration.table_result.JOINT_POSITION_SD', 10 * JOINT_POSITION_SD)
+    large = error_budget(result)
     assert small.total**2 == pytest.approx(sum(part**2 for part in small.causes.values()), rel=1e-12)
     assert large.causes['joint position'] == pytest.approx(10 * small.causes['joint position'], rel=1e-3, abs=1e-12)
 

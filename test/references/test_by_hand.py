@@ -382,7 +382,7 @@ def heldout_norm_rms(imu, ranges, gravity, **options):
     kept = [r for k, r in enumerate(ranges) if k % 3]
     found = calibrate_by_hand(imu, HandOptions(gravity), kept, **options)
     left_out = np.array([imu.force_s[r].mean(0) for r in ranges[::3]])
-    return float(np.sqrt(np.mean(found.norm_residuals(left_out)**2)))
+    return float(np.sqrt(np.mean(found.model.norm_rows(found.state.values, left_out)[0]**2)))
 
 
 @pytest.mark.real_data

@@ -118,12 +118,10 @@ class HandCalibration:
         """Return true specific force and rate for readings of shape (n, 3), at `time` s and `temperature_c` for effects that need them."""
         return self.model.compensate(self.state.values, force, rate, time=time, temperature_c=temperature_c)
 
-    def norm_residuals(self, force: np.ndarray | None = None) -> np.ndarray:
-        """Return ``|compensated force| - gravity`` of the poses, or of other mean readings at rest, shape (k,)."""
-        if force is None:
-            poses = self.poses
-            return self.model.norm_rows(self.state.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0]
-        return self.model.norm_rows(self.state.values, force)[0]
+    def norm_residuals(self) -> np.ndarray:
+        """Return ``|compensated force| - gravity`` of the poses, shape (k,)."""
+        poses = self.poses
+        return self.model.norm_rows(self.state.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0]
 
 
 def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), stills: Sequence | None = None, *,
