@@ -45,7 +45,7 @@ def _calibrated(folder, name, part):
 
 
 def transfer(folder, made, used, parts=(None, None)):
-    """Return (Calibrated or the refusal, Checked or None): calibrated on one recording or half, checked on another."""
+    """Return (Calibrated or the refusal, CheckResult or None): calibrated on one recording or half, checked on another."""
     table, block = recording(folder, used)
     try:
         found = _calibrated(folder, made, parts[0])

@@ -208,11 +208,18 @@ class CheckResult:
     """Findings of the checks of the recording."""
     why: str = 'fewer than three windows of rest or motion were found; record for longer'
     """Why there is no proof, where there is none."""
+    notes: tuple[str, ...] = ()
+    """Notes on the result."""
 
     @property
     def helps(self) -> bool:
         """Whether the decision on each sensor is `helps`."""
         return bool(self.proof) and len(self.helped) == len(self.proof)
+
+    @property
+    def exit_code(self) -> int:
+        """0 where the decision on each sensor is `helps`, otherwise 3."""
+        return 0 if self.helps else 3
 
     @property
     def helped(self) -> dict[str, Any]:
@@ -226,6 +233,13 @@ class CheckResult:
             return [f'unproven: {self.why}']
         return [*(f'{sensor} {decide(entry)}: {reason_of(entry)}' for sensor, entry in self.proof.items()),
                 *(f'{sensor}: {line}' for sensor, entry in self.proof.items() for line in worse_regimes(entry))]
+
+    def __str__(self):
+        helped = ', '.join(self.helped)
+        answer = 'the calibration helps' if self.helps else 'it helps ' + (f'the {helped} only' if helped else 'no sensor')
+        return '\n'.join([answer, *(f'  {line}' for line in (*self.lines, *self.notes))])
+
+    __repr__ = __str__
 
 
 def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calibration, *,

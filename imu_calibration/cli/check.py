@@ -26,7 +26,7 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.preprocessing.checks import warnings
     from imu_calibration.use_cases.check import check
     found = check(options.bag, options.calibration, stand_of(options), **choices_of(options))
-    warn([finding.to_mapping() for finding in warnings(found.result.findings)])
+    warn([finding.to_mapping() for finding in warnings(found.findings)])
     out, numbers = console(), ('seconds', 'before', 'after', 'after / before, 95 %')
     rows = []
     for sensor, entry in found.proof.items():

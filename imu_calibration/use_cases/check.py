@@ -1,6 +1,6 @@
 """Test whether a calibration reduces the errors of a recording."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 from os import PathLike
 from typing import Unpack
 
@@ -15,40 +15,8 @@ from imu_calibration.use_cases.recordings import name_of, open_bag, provenance_o
 from imu_calibration.use_cases.stand import Stand, table_of
 
 
-@dataclass(frozen=True, eq=False)
-class Checked:
-    """Result of a check: prints the decision."""
-
-    result: CheckResult
-    """The proof."""
-    notes: tuple[str, ...] = ()
-    """Notes on the result."""
-
-    @property
-    def proof(self) -> dict:
-        """Sensor -> error before and after, interval of their ratio, amount of data, by kind of motion."""
-        return self.result.proof
-
-    @property
-    def helps(self) -> bool:
-        """Whether the decision on each sensor is `helps`."""
-        return self.result.helps
-
-    @property
-    def exit_code(self) -> int:
-        """0 where the decision on each sensor is `helps`, otherwise 3."""
-        return 0 if self.helps else 3
-
-    def __str__(self):
-        helped = ', '.join(self.result.helped)
-        answer = 'the calibration helps' if self.helps else 'it helps ' + (f'the {helped} only' if helped else 'no sensor')
-        return '\n'.join([answer, *(f'  {line}' for line in (*self.result.lines, *self.notes))])
-
-    __repr__ = __str__
-
-
 def check(recording: str | PathLike | SampleBlock, calibration: Calibration | str | PathLike, table: Stand | None = None,
-          **choices: Unpack[Choices]) -> Checked:
+          **choices: Unpack[Choices]) -> CheckResult:
     """
     Test whether a calibration helps on a recording: the error before and after, by sensor and kind of motion.
 
@@ -74,13 +42,13 @@ def check(recording: str | PathLike | SampleBlock, calibration: Calibration | st
     options, topics = calibration_options(choices), topics_of(choices)
     if table is None:
         result = check_by_hand(source_of(recording, topics, want_joints=False), calibration, options)
-        return Checked(result, (*_gravity(options, calibration), *_notes(recording, calibration)))
+        return replace(result, notes=(*_gravity(options, calibration), *_notes(recording, calibration)))
     if not isinstance(recording, SampleBlock):
         open_bag(recording, topics, want_joints=True).close()
     table = table_of(table, [recording], topics, gravity=options.gravity)
     source = source_of(recording, topics, table.joint_names)
     result = check_on_table([source], table, calibration, options=options, names=[name_of(recording)])
-    return Checked(result, _notes(recording, calibration))
+    return replace(result, notes=_notes(recording, calibration))
 
 
 def _gravity(options, calibration):

@@ -47,7 +47,7 @@ def test_a_bias_that_moved_is_named(pair, calibrated):
     imu = pair.second.imu
     moved = replace(pair.second.block, imu=replace(imu, rate_s=imu.rate_s + 0.02))
     found = check(moved, calibrated.calibration, Table.from_mapping(pair.table))
-    assert not found.helps and any('the bias has changed' in line for line in found.result.lines)
+    assert not found.helps and any('the bias has changed' in line for line in found.lines)
 
 
 def test_the_recording_that_a_file_was_made_from_is_noticed(pair, calibrated):

@@ -47,7 +47,7 @@ def test_a_bias_that_moved_is_named(second, calibrated):
     moved = second.rate_s - 3 * calibrated.value('gyroscope', 'bias')   # it has passed zero, so that nothing at all would now be better
     found = check(SampleBlock(replace(second, rate_s=moved)), calibrated, gravity=GRAVITY)
     assert found.exit_code == 3 and found.proof['gyroscope']['regimes']['rest']['ci95'][0] > 1
-    assert 'bias' in found.result.lines[1]
+    assert 'bias' in found.lines[1]
 
 
 def test_a_file_of_another_imu_does_not_help(calibrated):

@@ -11,7 +11,8 @@ from refusal import refused
 from imu_calibration.calibration.diagnosis import hand_diagnosis
 from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.hand_diagnosis import diagnose_by_hand
+from imu_calibration.calibration.diagnosis.hand_diagnosis import told_by_hand
+from imu_calibration.calibration.hand_by_evidence import extended_by_hand
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import EARTH_RATE
@@ -44,6 +45,13 @@ def stops(force, rate, time, pose):
     """A bias of the accelerometer that changes at every stop: no catalogue holds it."""
     steps = np.random.default_rng(99).normal(0, 3 * MG, (pose.max() + 1, 3))
     return steps[pose], NOTHING
+
+
+def diagnose_by_hand(data, options):
+    """The findings and the extended calibration."""
+    found = investigate_by_hand(data, options)
+    hand = extended_by_hand(data, found, options)
+    return SimpleNamespace(diagnosis=told_by_hand(found, hand), hand=hand)
 
 
 def diagnosed(seed, spoil=None, n_poses=24, **options):

@@ -1,7 +1,7 @@
 """Diagnosis of a calibration by hand: the search on poses and turns, the residuals of the poses, and the places of other offsets."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -10,13 +10,11 @@ import numpy as np
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
 from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of
 from imu_calibration.calibration.diagnosis.traces import Traces
-from imu_calibration.calibration.hand_by_evidence import extended_by_hand
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import HELD, Solution
 from imu_calibration.references.gravity.effect_rows import Block
-from imu_calibration.references.gravity.hand_calibration import HandCalibration, HandData
-from imu_calibration.references.gravity.hand_options import HandOptions
-from imu_calibration.references.gravity.model_selection import HandInvestigation, investigate_by_hand
+from imu_calibration.references.gravity.hand_calibration import HandCalibration
+from imu_calibration.references.gravity.model_selection import HandInvestigation
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regime_variables import Variable, ranged
 from imu_calibration.selection.regimes import BY_CHANCE, AxisResidual, RegimeSearch, RestRegime, exchanges
@@ -141,30 +139,6 @@ def _explanations(hand):
     yield 'direction of gravity', up, every
     yield 'direction of gravity', np.stack([up[:, 0]**2 - up[:, 1]**2, up[:, 2]**2, up[:, 0] * up[:, 1], up[:, 1] * up[:, 2],
                                             up[:, 0] * up[:, 2]], axis=1), every
-
-
-@dataclass(frozen=True, eq=False)
-class HandDiagnosis:
-    """A diagnosis of a recording without a table."""
-
-    diagnosis: Diagnosis
-    """Findings."""
-    hand: HandCalibration
-    """The extended calibration; the baseline's without findings."""
-
-
-def diagnose_by_hand(data: HandData, options: HandOptions = HandOptions()) -> HandDiagnosis:
-    """
-    Diagnose the errors of a calibration by hand and their causes; arguments and errors as in `investigate_by_hand`.
-
-    Returns
-    -------
-    HandDiagnosis
-
-    """
-    found = investigate_by_hand(data, options)
-    hand = extended_by_hand(data, found, options)
-    return HandDiagnosis(told_by_hand(found, hand), hand)
 
 
 def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
