@@ -10,7 +10,7 @@ from imu_calibration.allan.figures import HORIZON, SLOW, AxisFigures, NoiseFigur
 from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, NoiseProcess, mean_covariance
 from imu_calibration.allan.terms import DETERMINED, HELD, TIME, WEAK, Term
 from imu_calibration.core.documents import finite, from_text, to_text
-from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.units import NOISE, STANDARD_GRAVITY, for_people, significant
 from imu_calibration.effects.base import AXES, SENSORS, UNIT
 
@@ -100,10 +100,7 @@ def noise_from_text(text: str) -> NoiseFigures:
         When the text is no such document, newer, or a figure is missing or cannot be.
 
     """
-    try:
-        document = from_text(text, 'noise document')
-    except InputError as error:
-        raise DocumentError(str(error), code=error.code) from error
+    document = from_text(text, 'noise document')
     found = str(document.get('format'))
     if found != FORMAT:
         raise DocumentError(f"a noise document must have 'format: {FORMAT}', got '{found}'; give a file written by 'imu_calibration noise'",

@@ -325,6 +325,7 @@ def residual_spectrum(result: CalibrationResult, windows: Sequence[Window]) -> t
     .. [1] P. D. Welch, IEEE Trans. Audio Electroacoust. 15 (1967) 70-73.
 
     """
+    from scipy.signal import welch  # here, because its import is slow
     windows = [window for window in windows if window.kind != 'static' and len(window) >= SHORTEST]
     if not windows:
         return np.zeros(0), {sensor: np.zeros((0, 3)) for sensor in SENSORS}
@@ -335,19 +336,6 @@ def residual_spectrum(result: CalibrationResult, windows: Sequence[Window]) -> t
     residuals = [result.residuals_of(window) for window in windows]
     density = {}
     for sensor in SENSORS:
-        spectra = [_power(own[sensor], rate, segment) for own in residuals]
+        spectra = [welch(own[sensor], rate, nperseg=segment, axis=0)[1] for own in residuals]
         density[sensor] = np.sqrt(np.average(spectra, axis=0, weights=weights))[1:]
     return np.fft.rfftfreq(segment, 1 / rate)[1:], density
-
-
-def _power(values, rate, segment):
-    """
-    Return the one-sided power density, shape (segment // 2 + 1, 3), by segments that overlap by half under a Hann window.
-
-    As ``scipy.signal.welch``, whose import takes longer than the figure.
-    """
-    pieces = np.lib.stride_tricks.sliding_window_view(values, segment, axis=0)[::segment - segment // 2]
-    hann = np.hanning(segment + 1)[:-1]
-    power = (np.abs(np.fft.rfft((pieces - pieces.mean(axis=-1, keepdims=True)) * hann))**2).mean(axis=0).T / (rate * (hann**2).sum())
-    power[1:-1 if segment % 2 == 0 else None] *= 2
-    return power

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, cast
 
 import numpy as np
 
-from imu_calibration.core.errors import InputError, shortened
+from imu_calibration.core.errors import DocumentError, shortened
 
 LARGEST = 2_000_000
 """Largest number of characters of a document; the covariance of a hundred parameters has 300 000."""
@@ -80,7 +80,7 @@ def from_text(text: str, what: str = 'document') -> dict[str, Any]:
     """Return the mapping in a YAML text; raises as `parsed`, also when it is not a mapping."""
     document = parsed(text, what)
     if not isinstance(document, dict):
-        raise InputError(f'a {what} must be a mapping, got {type(document).__name__}; correct the file', code='not_a_mapping')
+        raise DocumentError(f'a {what} must be a mapping, got {type(document).__name__}; correct the file', code='not_a_mapping')
     return document
 
 
@@ -98,7 +98,7 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
 
     Raises
     ------
-    InputError
+    DocumentError
         When the text is not YAML, is too large or too deep, repeats a key or is built on aliases; a text of a few lines could otherwise
         exhaust the memory.
 
@@ -110,7 +110,8 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
         _look_through(yaml.parse(text, Loader=loader), what, aliases)
         return yaml.load(text, Loader=loader)
     except (yaml.YAMLError, *NO_SUCH_VALUE) as error:
-        raise InputError(f'a {what} must be YAML, this is not: {shortened(str(error), 500)}; correct the file', code='not_yaml') from error
+        raise DocumentError(f'a {what} must be YAML, this is not: {shortened(str(error), 500)}; correct the file',
+                            code='not_yaml') from error
 
 
 def _look_through(events, what, aliases):
@@ -125,7 +126,7 @@ def _look_through(events, what, aliases):
             sizes[anchor] = count - start
             continue
         if kind == 'AliasEvent' and not (aliases and event.anchor in sizes):
-            raise InputError(f'a {what} must not use aliases, this document has YAML aliases (*{event.anchor}); write it without',
+            raise DocumentError(f'a {what} must not use aliases, this document has YAML aliases (*{event.anchor}); write it without',
                              code='yaml_alias')
         if open_parts and open_parts[-1][2] is not None:
             _check_key(event, open_parts[-1], what)
@@ -149,14 +150,14 @@ def _check_key(event, mapping, what):
         return
     key = getattr(event, 'value', None)
     if key in mapping[2] or (key == '<<' and event.implicit[0]):
-        raise InputError(f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line '
+        raise DocumentError(f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line '
                          f'{event.start_mark.line + 1}; remove it', code='key_repeated')
     mapping[2].update([key] if key is not None else [])
 
 
 def _within_limits(number, limit, what, unit):
     if number > limit:
-        raise InputError(f'a {what} must not have more than {limit} {unit}, this one has more; is it the right file?',
+        raise DocumentError(f'a {what} must not have more than {limit} {unit}, this one has more; is it the right file?',
                          code='document_limit')
 
 

@@ -63,7 +63,7 @@ class NotObservableError(ImuCalibrationError):
 
 
 class DocumentError(InputError):
-    """A calibration document cannot be used."""
+    """A document cannot be used."""
 
 
 def printable(text: str) -> str:

@@ -412,8 +412,4 @@ def calibration_from_text(text: str) -> Calibration:
         When it is no calibration, newer, or implausible.
 
     """
-    try:
-        mapping = from_text(text, 'calibration document')
-    except InputError as error:
-        raise DocumentError(str(error), code=error.code) from error
-    return from_mapping(mapping)
+    return from_mapping(from_text(text, 'calibration document'))

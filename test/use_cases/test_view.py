@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.coverage import line_of
-from imu_calibration.calibration.table_result import _power, residual_spectrum
+from imu_calibration.calibration.table_result import residual_spectrum
 from imu_calibration.cli.main import main
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.calibration import UNKNOWN
@@ -110,14 +110,6 @@ def test_a_line_stands_at_its_frequency_and_white_noise_at_its_density():
     frequency, density = residual_spectrum(SimpleNamespace(residuals_of=lambda _: {'accelerometer': tone + 3.0, 'gyroscope': noise}), windows)
     assert frequency[np.argmax(density['accelerometer'][:, 0])] == pytest.approx(12, abs=0.1) and frequency[0] > 0
     assert np.sqrt(np.mean(density['gyroscope']**2)) == pytest.approx(0.01 * np.sqrt(2 / 100), rel=0.05)
-
-
-@pytest.mark.parametrize('segment', [255, 256])
-def test_the_density_of_one_window_is_that_of_scipy(segment):
-    from scipy.signal import welch
-    values = np.random.default_rng(2).normal(size=(segment * 3 + 7, 3)) + 5.0
-    _, power = welch(values, 50.0, nperseg=segment, axis=0)
-    np.testing.assert_allclose(_power(values, 50.0, segment)[1:], power[1:], rtol=1e-11)
 
 
 @pytest.mark.parametrize('along', [(1, 0, 0), (0, 1, 0), (0, 0, -1), (-1, 0, 0), (0.6, -0.48, 0.64)])
