@@ -91,9 +91,55 @@ def residual(result: CalibrationResult) -> dict[str, Any]:
         for k in np.argsort(errors.time, kind='stable')]}
 
 
+LONGEST_SEGMENT = 1024
+"""Most samples of a segment: a finer resolution than that of a recording of a minute is not useful."""
+SHORTEST_SEGMENT = 64
+"""Windows with fewer samples are left out."""
+
+
+def residual_spectrum(result: CalibrationResult, windows: Sequence[Window]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """
+    Return (frequency, sensor -> density) of the residuals of the windows with motion among some.
+
+    Welch's method [1]: the power of segments of one length, each about its own mean, averaged over all windows.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+        The calibration that predicts them.
+    windows : sequence of Window
+        With their samples.
+
+    Returns
+    -------
+    frequency : ndarray
+        Above zero, Hz, shape (n,); none where no window is long enough.
+    dict
+        Sensor -> one-sided amplitude density, (m/s^2)/sqrt(Hz) or (rad/s)/sqrt(Hz), shape (n, 3).
+
+    References
+    ----------
+    .. [1] P. D. Welch, IEEE Trans. Audio Electroacoust. 15 (1967) 70-73.
+
+    """
+    from scipy.signal import welch  # here, because its import is slow
+    windows = [window for window in windows if window.kind != 'static' and len(window) >= SHORTEST_SEGMENT]
+    if not windows:
+        return np.zeros(0), {sensor: np.zeros((0, 3)) for sensor in SENSORS}
+    segment = min(LONGEST_SEGMENT, int(np.median([len(window) for window in windows])))
+    windows = [window for window in windows if len(window) >= segment]
+    rate = 1 / float(np.median([window.period for window in windows]))
+    weights = np.array([len(window) for window in windows], float)
+    residuals = [result.residuals_of(window) for window in windows]
+    density = {}
+    for sensor in SENSORS:
+        spectra = [welch(own[sensor], rate, nperseg=segment, axis=0)[1] for own in residuals]
+        density[sensor] = np.sqrt(np.average(spectra, axis=0, weights=weights))[1:]
+    return np.fft.rfftfreq(segment, 1 / rate)[1:], density
+
+
 def spectrum(result: CalibrationResult, windows: Sequence[Window]) -> dict[str, Any]:
     """Return the amplitude density of the residuals within windows with motion; no lines where none is long enough."""
-    from imu_calibration.calibration.table_result import residual_spectrum
     frequency, density = residual_spectrum(result, windows)
     return {'lines': [{'frequency': float(f), **_by_sensor(density, k)} for k, f in enumerate(frequency)]}
 

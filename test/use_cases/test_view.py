@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.coverage import line_of
-from imu_calibration.calibration.table_result import residual_spectrum
 from imu_calibration.cli.main import main
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.calibration import UNKNOWN
@@ -19,7 +18,18 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.diagnose import diagnose
-from imu_calibration.use_cases.view import PARAMETERS, RESIDUAL, SCHEMAS, SPECTRUM, SPHERE, _coverage, _from_x, scene_of, view
+from imu_calibration.use_cases.view import (
+    PARAMETERS,
+    RESIDUAL,
+    SCHEMAS,
+    SPECTRUM,
+    SPHERE,
+    _coverage,
+    _from_x,
+    residual_spectrum,
+    scene_of,
+    view,
+)
 
 from worlds.hand_sessions import GRAVITY, simulate
 
