@@ -5,6 +5,7 @@ import math
 import os
 import re
 import zipfile
+from collections.abc import Mapping
 from enum import StrEnum
 from errno import EINVAL
 from functools import cache
@@ -35,6 +36,28 @@ DEEPEST = 20
 def finite(value: float) -> float | None:
     """Return a float, or None for an infinite value or NaN, which documents do not contain."""
     return float(value) if math.isfinite(value) else None
+
+
+def plain(value: Any) -> Any:
+    """Return a value with arrays as lists and numpy's numbers as Python's."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+def json_types(value: Any) -> Any:
+    """Return a value as JSON types: mappings, lists, text, finite numbers, null."""
+    if isinstance(value, Mapping):
+        return {str(key): json_types(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set)):
+        return [json_types(item) for item in value]
+    if hasattr(value, 'tolist'):
+        return json_types(value.tolist())
+    if isinstance(value, float):
+        return finite(value)
+    return value if value is None or isinstance(value, (str, bool, int)) else str(value)
 
 
 def to_text(document: dict[str, Any]) -> str:

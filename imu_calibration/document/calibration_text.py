@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.core.documents import from_text, to_text
+from imu_calibration.core.documents import from_text, plain, to_text
 from imu_calibration.core.errors import DocumentError, InputError, shortened
 from imu_calibration.document.calibration import Calibration, with_nominal
 from imu_calibration.document.decision import HARMS, SensorDecision
@@ -311,21 +311,21 @@ def to_mapping(calibration: Calibration) -> dict:
     """Return the document as plain dicts, lists, floats and strings, in a fixed order."""
     document: dict[str, Any] = {'format': FORMAT, 'frame_id': calibration.frame_id, 'gauge': dict(calibration.gauge)}
     if calibration.model.definitions:
-        document['effects'] = _plain(calibration.model.definitions)
+        document['effects'] = plain(calibration.model.definitions)
     for section in SECTIONS:
         document[section] = _section(calibration, section)
     document['reference_temperature_c'] = float(calibration.model.temperature_ref_c)
     document['joint_names'] = list(calibration.model.joint_names)
     if (errors := calibration.model.joint_names.errors) is not None:
         document['joint_errors'] = errors
-    document['covariance'] = {'names': list(calibration.param_names), 'matrix': _plain(calibration.covariance)}
+    document['covariance'] = {'names': list(calibration.param_names), 'matrix': plain(calibration.covariance)}
     if calibration.covariance_terms:
-        document['covariance_terms'] = _plain(calibration.covariance_terms)
+        document['covariance_terms'] = plain(calibration.covariance_terms)
     document['undetermined_directions'] = [dict(direction) for direction in calibration.undetermined]
     for name in ('statistics', 'conditions', *_WHERE_KNOWN, 'provenance'):
         part = getattr(calibration, name)
         if part or name not in _WHERE_KNOWN:
-            document[name] = _plain(part)
+            document[name] = plain(part)
     return document
 
 
@@ -336,28 +336,15 @@ def _section(calibration, section):
         part = calibration.model.slices[effect.key]
         status = np.array(calibration.status, dtype=object)[part].reshape(effect.shape)
         entries[effect.name] = {
-            'value': _plain(calibration.values[part].reshape(effect.shape)), 'sd': _plain(calibration.own_sd[part].reshape(effect.shape)),
+            'value': plain(calibration.values[part].reshape(effect.shape)), 'sd': plain(calibration.own_sd[part].reshape(effect.shape)),
             'unit': effect.unit if isinstance(effect.unit, str) else list(effect.unit), 'status': status.tolist()}
         centre = {group.name: calibration.model.centre[group.name] for group in effect.groups if group.name in calibration.model.centre}
         if centre:
-            entries[effect.name]['centre'] = _plain(centre)
+            entries[effect.name]['centre'] = plain(centre)
         reasons = [calibration.held_reason.get(name, '') for name in effect.param_names()]
         if any(reasons):
             entries[effect.name]['held_reason'] = np.array(reasons, dtype=object).reshape(effect.shape).tolist()
     return entries
-
-
-def _plain(value):
-    """Return value with arrays and numpy numbers turned into lists and Python numbers."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
-    return value
 
 
 def from_mapping(document: Any) -> Calibration:

@@ -31,8 +31,8 @@ from tools.tolerance_file import rendered
 ROOT = Path(__file__).resolve().parents[2]
 ALSO_WORDS = {'bias', 'matrix'}
 """Names that are plain words too: keys of documents and headings use them."""
-KEYS_ELSEWHERE = {'allan': {'time_constant'}, 'estimation': {'earth_rate'}, 'targets': {'time_offset'}}
-"""Package -> words that are keys in its own documents, of noise, of terms of a variance and of other programs, and speak of no effect there."""
+KEYS_ELSEWHERE = {'allan': {'time_constant'}, 'core': {'time_constant'}, 'estimation': {'earth_rate'}, 'targets': {'time_offset'}}
+"""Package -> words that are keys in its own documents, of noise, of units, of terms of a variance and of other programs, and speak of no effect there."""
 
 
 def spoken_of(path):

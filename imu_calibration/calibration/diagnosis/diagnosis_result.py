@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.core.documents import json_types
 from imu_calibration.effects.base import SENSORS, UNIT
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
@@ -130,7 +131,7 @@ FORMAT = 'imu_calibration/diagnosis/1'
 
 def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the content of diagnosis.json: plain dicts, lists, strings and numbers, None for NaN and infinity."""
-    return _plain({
+    return json_types({
         'format': FORMAT,
         'baseline': {sensor: _baseline(diagnosis.baseline, sensor) for sensor in SENSORS},
         'onset': None if diagnosis.onset is None else diagnosis.onset.to_mapping(),
@@ -178,17 +179,3 @@ def _rest(sensor, rest, locked):
             'share': rest.share, 'where': '; '.join(regime.text for regime in rest.regimes) or None, 'axes': list(rest.axes),
             'regimes': [regime.to_mapping() for regime in rest.regimes], 'tones': [tone.to_mapping() for tone in rest.tones],
             'proposals': [] if rest.proposal is None else [rest.proposal.to_mapping() | {'gain': _gain(formula_gain(rest, locked))}]}
-
-
-def _plain(value):
-    if isinstance(value, dict):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value

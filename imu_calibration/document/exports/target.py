@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from imu_calibration.allan.figures import Densities
-from imu_calibration.core.documents import from_text, to_text
+from imu_calibration.core.documents import from_text, plain, to_text
 from imu_calibration.core.errors import InputError, printable, shortened
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.exports.affine import AffineImu, Holding, Placement, as_mounted
@@ -26,17 +26,6 @@ def commented(lines: list[str], mark: str = '# ') -> str:
 def yaml_file(comments: list[str], mapping: dict, head: str = '') -> str:
     """Return a YAML file with comments before the content; `head` is a line that must be first."""
     return head + commented(comments) + to_text(plain(mapping))
-
-
-def plain(value: Any) -> Any:
-    """Return a value with arrays as lists and numpy's numbers as Python's."""
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def read_yaml(content: bytes, what: str) -> dict:
