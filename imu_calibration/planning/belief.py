@@ -200,8 +200,13 @@ class WindowPredictor:
             begin += segment.duration
 
     def _wander(self, sensor, count, seconds):
-        """Return how the bias wanders within a window: variances and the directions that they belong to."""
-        return np.linalg.eigh(self.noise[sensor].wander_within(((np.arange(count) + 0.5) / count - 0.5) * seconds))
+        """
+        Return (variances, directions) of the changes of the bias after the middle of a window.
+
+        Given its value in the middle, the bias before is independent of the bias after, with the mirrored covariance.
+        """
+        half = count // 2
+        return np.linalg.eigh(self.noise[sensor].wander_within(((np.arange(count - half, count) + 0.5) / count - 0.5) * seconds))
 
     def _window(self, cut, designs, wander_of):
         motion, kind, middle, length, seconds = cut
@@ -211,8 +216,12 @@ class WindowPredictor:
             slope, noise = self.coordinates.slopes[sensor], self.noise[sensor]
             means[sensor], variance[sensor] = np.empty((3, slope.shape[2])), np.empty(3)
             reference = noise.reference.variance([kind], np.array([seconds]))[0]
-            wander, turned = wander_of(sensor, count, seconds)
-            rows, ones = turned.T @ design, turned.sum(axis=0)
+            after, turned = wander_of(sensor, count, seconds)
+            wander = np.concatenate([after, np.zeros(count % 2), after])
+            early, centre, late = np.split(np.column_stack([np.ones(count), design]), [len(after), count - len(after)])
+            # Without the copy numpy multiplies reversed rows without BLAS.
+            rows = np.concatenate([turned.T @ early[::-1].copy(), centre, turned.T @ late])
+            ones, rows = rows[:, 0], rows[:, 1:]
             for axis in range(3):
                 weight = 1 / (noise.low_variance[axis] * count / samples + wander)
                 variance[sensor][axis] = 1 / (weight @ ones**2)
