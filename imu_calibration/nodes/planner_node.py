@@ -96,6 +96,8 @@ def restricted_limits(limits: MotionLimits, position: np.ndarray, settings: Plan
 
 PERIOD = 0.1
 """Seconds between two checks of the clock."""
+MID_MOTION = 'stopped in mid-motion'
+"""Outcome of a node that ended during a motion."""
 ANSWER_PATIENCE = 60.0
 """Seconds to wait for a solution, and for a diagnosis that has begun."""
 
@@ -157,7 +159,7 @@ class PlannerNode(Node):
         """Stop the joints; return the outcome."""
         unstopped = self.driver.is_driving   # the context has ended, and no message can be sent
         self.worker.end()
-        return 'the joints finish the motion that they are in' if unstopped else 'stopped in mid-motion' if self._is_halted else ''
+        return 'the joints finish the motion that they are in' if unstopped else MID_MOTION if self._is_halted else ''
 
     def halt(self) -> None:
         """Stop the joints; called at the first signal, while messages can still be sent."""

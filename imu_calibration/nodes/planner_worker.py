@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND, MATES, SIZE
@@ -20,6 +21,17 @@ from imu_calibration.planning.driver import Driver, DriveState
 
 PERIOD = 0.05
 """Seconds between two checks of the driver."""
+
+
+class Activity(StrEnum):
+    """Present activity of the worker, as /diagnostics reports it."""
+
+    NONE = ''
+    PLANNING = 'planning'
+    DIAGNOSING = 'diagnosing'
+    AWAITING_REST = 'waiting until the joints rest'
+    AWAITING_STOP = 'waiting for the controller to stop'
+    AWAITING_CALIBRATION = 'waiting for the calibration'
 
 
 @dataclass(frozen=True)
@@ -61,8 +73,7 @@ class PlannerWorker(threading.Thread):
         super().__init__(name='planner', daemon=True)
         self.driver, self._make_campaign, self._peers, self._lock = driver, make_campaign, peers, lock
         self.campaign: Campaign | None = None
-        self.doing = ''
-        """Description of the present activity."""
+        self.doing = Activity.NONE
         self.motion: Any = None
         """The motion that is driven, or was driven last."""
         self.seconds = 0.0
@@ -122,7 +133,7 @@ class PlannerWorker(threading.Thread):
                     self._give_up(str(error))
                 except Exception as error:   # no failure may leave the joints without supervision
                     self._give_up(f'planning failed: {shortened(f"{type(error).__name__}: {error}", 200)}')
-                self.doing = ''
+                self.doing = Activity.NONE
 
     def _give_up(self, why):
         if self.driver.state is not DriveState.STOPPED:
@@ -135,14 +146,14 @@ class PlannerWorker(threading.Thread):
             self._wanted = 0
             return
         if self.campaign is None:
-            self.doing = 'planning'
+            self.doing = Activity.PLANNING
             self.campaign = self._make_campaign()
         self._wait_for_rest()
         if self.driver.state is DriveState.MEASURING:
             self._measure()
         decision = self._decide()
         while decision is not None and decision.diagnose:
-            self.doing = 'diagnosing'
+            self.doing = Activity.DIAGNOSING
             self._peers.say(INFO, f'{decision.why}; diagnosing')
             asked = self.campaign.take_findings(self._peers.diagnose())
             if asked:
@@ -158,18 +169,18 @@ class PlannerWorker(threading.Thread):
         patience = self.driver.settings.settling_patience
         end = time.monotonic() + patience
         while self._wanted and not self._ending and not self.driver.rests:
-            self.doing = 'waiting until the joints rest'
+            self.doing = Activity.AWAITING_REST
             if trouble := self.driver.stamp_fault(time.monotonic()):
                 raise InputError(trouble)
             if self.driver.awaits_stop and not self.driver.is_silent(time.monotonic()):   # no other driver need be searched for yet
-                self.doing, end = 'waiting for the controller to stop', time.monotonic() + patience
+                self.doing, end = Activity.AWAITING_STOP, time.monotonic() + patience
             if time.monotonic() > end:
                 raise InputError(f'the joints must rest before a motion begins, they moved for {patience:g} s; find the cause')
             self._wake.wait(PERIOD)
             self._wake.clear()
 
     def _measure(self):
-        self.doing = 'waiting for the calibration'
+        self.doing = Activity.AWAITING_CALIBRATION
         calibration = self._peers.measure()
         if calibration is not None:
             self.campaign.take(calibration)
@@ -183,7 +194,7 @@ class PlannerWorker(threading.Thread):
     def _decide(self):
         if not self._wanted or self._ending:
             return None
-        self.doing = 'planning'
+        self.doing = Activity.PLANNING
         decision = self.campaign.decide(self.driver.position, self.elapsed)
         self.worst, self.outside = self.campaign.worst, sum(excess > 1.0 for excess in self.campaign.planner.excess.values())
         return decision

@@ -151,7 +151,7 @@ def test_motion_of_another_model_or_a_damaged_file_is_put_aside_and_the_session_
     assert (tmp_path / 'calibration.accumulator.npz.2').read_bytes() == b'damaged'
     line, = [line for level, line in bench.said if level == 'error' and f'{tmp_path}/calibration.accumulator.npz.2' in line]
     assert ' 7 ' in line   # bytes
-    assert line.count('remove') == 1 and not any(word in line for word in ('pickle', 'Error', 'numpy', 'without resume'))
+    assert not any(word in line for word in ('pickle', 'Error', 'numpy', 'without resume'))
 
 
 def test_whatever_fails_within_is_told_and_the_session_goes_on(bench, session, tmp_path):
