@@ -25,6 +25,7 @@ FORMULA = CATALOGUE.with_effects(term('warm_force', sensor='gyroscope', column='
                                       tolerance=1e-6, text='A formula.', largest=1e-4))
 SESSIONS = {'bias and matrix': {}, 'findings': {'effects': ['accel_quadratic', 'gyro_g_sensitivity', 'gyro_bias_drift']},
             'thermal': {'effects': ['accel_thermal_bias', 'gyro_thermal_scale']}, 'formula': {'effects': ['warm_force'], 'catalogue': FORMULA}}
+RATES = {'imu_rate': 50.0, 'joint_rate': 50.0}
 
 
 def spoiled(calibration, seed=3):
@@ -41,7 +42,7 @@ def same(found, wanted):
 
 @pytest.mark.parametrize('name', SESSIONS)
 def test_check_reports_the_error_of_the_compensated_bag(name, tmp_path):
-    session = imu.simulate('quick', seed=4, **SESSIONS[name])
+    session = imu.simulate('quick', seed=4, **RATES, **SESSIONS[name])
     session.save(tmp_path / 'bag')
     known = spoiled(session.truth)
     checked = imu.check(tmp_path / 'bag', known, session.table)
@@ -124,7 +125,7 @@ def model_output(calibration, time):
 def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
     """The bias contains its mean; without that the applied bias is off by the mean, here ten times the scatter about it."""
     effect = term('by_angle', sensor='gyroscope', column='cos(0.1 * angle_1)', unit='rad/s', tolerance=1e-4, text='A formula.')
-    session = imu.simulate('quick', seed=5)
+    session = imu.simulate('quick', seed=5, **RATES)
     catalogue, mean = CATALOGUE.with_effects(effect), 0.5 * DEG
     moved = replace(session.samples, imu=replace(session.samples.imu, rate_s=session.samples.imu.rate_s + mean))
     result = imu.calibrate(moved, session.table, catalogue=catalogue, gyroscope_model='bias+matrix+by_angle', model_as_asked=True).result

@@ -18,13 +18,13 @@ from imu_calibration.selection.investigation import investigate
 
 from worlds.hiding import Sizes, record
 
-SEED = 3
+SEED, QUICK = 3, {'profile': 'quick', 'imu_rate': 50.0, 'joint_rate': 50.0}
 
 
 @pytest.fixture(scope='module')
 def empty():
     """Return a session that hides nothing."""
-    return record(SEED, None, 'white', through_bag=False, profile='quick')
+    return record(SEED, None, 'white', through_bag=False, **QUICK)
 
 
 @pytest.fixture(scope='module')
@@ -36,7 +36,7 @@ def sizes(empty):
 @lru_cache(maxsize=None)
 def seek(effect, sizes):
     """Return (recording, diagnosis) of the session with one effect hidden."""
-    recording = record(SEED, {effect: sizes.hidden(effect, SEED, 5.0)}, 'white', through_bag=effect == 'accel_quadratic', profile='quick')
+    recording = record(SEED, {effect: sizes.hidden(effect, SEED, 5.0)}, 'white', through_bag=effect == 'accel_quadratic', **QUICK)
     return recording, diagnose(recording.windows, recording.table, recording.model)
 
 
@@ -62,7 +62,7 @@ def test_hidden_effect_is_the_first_finding_with_honest_parameters(effect, sizes
 
 
 def test_cause_outside_the_catalogue_is_unexplained_and_not_named():
-    recording = record(SEED, {'angle_bias_accel': None}, 'realistic', through_bag=False, profile='quick')
+    recording = record(SEED, {'angle_bias_accel': None}, 'realistic', through_bag=False, **QUICK)
     diagnosis = diagnose(recording.windows, recording.table, recording.model)
     assert diagnosis.findings == ()
     assert diagnosis.unexplained['accelerometer'].significant
@@ -72,7 +72,7 @@ def test_cause_outside_the_catalogue_is_unexplained_and_not_named():
 
 
 def test_earlier_choice_is_replaced_by_the_simpler_effect_that_does_as_well(sizes):
-    recording = record(SEED, {'lever_arm': sizes.hidden('lever_arm', SEED, 5.0)}, 'white', through_bag=False, profile='quick')
+    recording = record(SEED, {'lever_arm': sizes.hidden('lever_arm', SEED, 5.0)}, 'white', through_bag=False, **QUICK)
     search = investigate(recording.windows, recording.table, recording.model).attempt.search
     nine_arms = next(q for q in search.questions if q.name == 'accel_size_effect')
     assert [q.name for q in search.reconsidered([nine_arms])] == ['lever_arm']
@@ -107,7 +107,7 @@ def test_a_bias_that_follows_the_thermometer_is_named_beside_a_wander_and_a_wand
 
 def test_what_locked_windows_show_moves_the_gain_and_nothing_else(sizes):
     """Ten standard deviations onto one locked window of each kind."""
-    recording = record(SEED, {'accel_quadratic': sizes.hidden('accel_quadratic', SEED, 5.0)}, 'white', through_bag=False, profile='quick')
+    recording = record(SEED, {'accel_quadratic': sizes.hidden('accel_quadratic', SEED, 5.0)}, 'white', through_bag=False, **QUICK)
     used = [window for window in recording.windows if window.kind != 'unused']
     locked, kinds = locked_windows(np.array([window.kind for window in used])), np.array([window.kind for window in used])
     struck = [next(window for window, out, own in zip(used, locked, kinds) if out and own == kind) for kind in np.unique(kinds)]

@@ -30,6 +30,7 @@ from imu_calibration.nodes.diagnosis_thread import DiagnosisThread  # noqa: E402
 
 from ros.threads import until  # noqa: E402
 
+QUICK = {'profile': 'quick', 'imu_rate': 50.0, 'joint_rate': 50.0}
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
 
@@ -50,7 +51,7 @@ class Station:
 @pytest.fixture(scope='module')
 def hidden():
     """A session with quadratic terms that the model lacks."""
-    return physics.make_session(3, {'accel_quadratic': None}, profile='quick')
+    return physics.make_session(3, {'accel_quadratic': None}, **QUICK)
 
 
 @pytest.fixture(scope='module')
@@ -174,7 +175,7 @@ def test_a_resumed_session_keeps_what_joined(station, hidden):
 
 
 def test_nothing_is_found_where_nothing_is_hidden():
-    station = Station(physics.make_session(3, profile='quick'))
+    station = Station(physics.make_session(3, **QUICK))
     before, answer = station.live.result.calibration, station.question().answer()
     assert answer.state.word == 'nothing found'
     assert answer.demand.is_nothing and not station.live.adopt(answer.demand)

@@ -132,7 +132,7 @@ def test_its_derivative_is_that_of_differences(name):
 @lru_cache(maxsize=None)
 def session(*names):
     """Return a simulated session of an IMU with added effects."""
-    return imu.simulate('quick', effects=names, size=0.5, seed=5, catalogue=MINE)
+    return imu.simulate('quick', effects=names, size=0.5, seed=5, catalogue=MINE, imu_rate=50.0, joint_rate=50.0)
 
 
 ASKED = {'accelerometer': 'bias+matrix+accel_size_effect', 'gyroscope': 'bias+matrix'}
