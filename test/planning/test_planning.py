@@ -65,9 +65,10 @@ def test_every_tolerance_is_met_and_the_least_time_is_less(plan):
     assert np.all(plan.sd[plan.wanted] <= plan.tolerances[plan.wanted] * (1 + 1e-6))
 
 
-def test_the_same_is_planned_again(plan, table):
-    again = make_planner(table, noise=NOISE, tolerances=TIGHT).plan()
-    assert [motion.words for motion in again.motions] == [motion.words for motion in plan.motions]
+def test_the_same_is_planned_again():
+    table = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'inner', 'axis': [1, 0, 0]}], 'gravity': 9.81})
+    first, again = (make_planner(table, noise=NOISE, tolerances=TIGHT).plan(with_bound=False) for _ in range(2))
+    assert len(first.motions) > 10 and [motion.words for motion in again.motions] == [motion.words for motion in first.motions]
 
 
 def test_what_is_promised_is_what_a_calibration_of_the_motion_comes_to(plan, table):
