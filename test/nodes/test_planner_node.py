@@ -308,7 +308,7 @@ def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_mo
         loop.until(lambda: loop.value('state') == 'moving', 'the first motion, of four seconds')
         assert loop.call('/planner_node/stop').success
         loop.until(lambda: len(places) > 200 and np.ptp(places[-100:], axis=0).max() == 0.0, 'rest')
-        assert loop.value('state') == 'stopped' and '~/stop' in loop.drive()
+        loop.until(lambda: loop.value('state') == 'stopped' and '~/stop' in loop.drive(), 'the stop')
         assert loop.call('/planner_node/stop').success   # twice is no harm
         loop.ask('start')   # goes on with what is known; slowly at first
         loop.until(lambda: loop.value('state') == 'moving', 'another motion')
