@@ -42,7 +42,7 @@ class Topics(NamedTuple):
 def existing(path: str | PathLike) -> Path:
     """Return the path of a bag that is there."""
     if not Path(path).exists():
-        raise InputError(f'the bag {path} must exist, no such file; correct the path')
+        raise InputError(f'the bag {path} must exist, no such file; correct the path', code='bag_missing')
     return Path(path)
 
 
@@ -92,7 +92,7 @@ def name_of(recording: str | PathLike | SampleBlock) -> str:
 
 def _hash_of(recording):
     if not isinstance(recording, SampleBlock):
-        return files.hash_of(recording)
+        return files.hash_of(existing(recording))
     imu = recording.imu
     return sha256(imu.stamp_ns.tobytes() + imu.force_s.tobytes() + imu.rate_s.tobytes()).hexdigest()
 

@@ -9,6 +9,7 @@ from imu_calibration.calibration.by_evidence import extended_solution
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, parameters_of
 from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of_one_joint, sentence, separating_motion
 from imu_calibration.calibration.diagnosis.traces import residual_traces
+from imu_calibration.core.progress import report
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
@@ -129,6 +130,7 @@ def _clipping(limit, solution):
 
 def look_beyond(found: Examination) -> dict[str, Unexplained]:
     """Return sensor -> the unexplained excess with its tones, and with regimes and a proposal where it is significant."""
+    report('analysing the residual')
     tones = find_tones(found, found.table, [proposal for sensor in found.rests if (proposal := found.proposal(sensor)) is not None])
     looked = {sensor: replace(rest, tones=tones[sensor]) for sensor, rest in found.rests.items()}
     for sensor, rest in looked.items():
