@@ -230,7 +230,7 @@ def test_the_notebook_runs_cell_by_cell_and_shows_its_plots(capsys):
     assert re.match(r'\d+ parameters, largest error \d\.\d sd, rms [01]\.\d\d sd\n', capsys.readouterr().out)
 
 
-@pytest.mark.parametrize('verb', [imu.calibrate, imu.diagnose, imu.noise])
+@pytest.mark.parametrize('verb', [imu.calibrate, imu.diagnose])
 def test_a_bag_that_does_not_exist_is_refused_in_one_line(verb, tmp_path):
     with refused(InputError, 'bag_missing', tmp_path / 'none'):
         verb(tmp_path / 'none')
