@@ -18,7 +18,7 @@ LOWEST, HIGHEST_ORDER = 4, 64
 """Orders under test; lower ones are formulas."""
 PIECE_S = 2.0
 """Length of the pieces for comparison of phases, s."""
-LEAST_CYCLES = 1.5
+CYCLES_OF_ORDER = 1.5
 """Of an order in a piece that can show it: less is a slope or a curve."""
 LEAST_PIECES = 8
 """Least number of pieces for an estimate of the scatter."""
@@ -121,7 +121,7 @@ def _pieces(windows, rests, joint) -> Iterator[tuple[int, np.ndarray, np.ndarray
 def _projected(rest, time, angle, order):
     """Return (sum of the rest against each order, shape (k, 3), weight, shape (k,)); zero where a piece does not show an order."""
     turned = np.ptp(angle)
-    shown = (turned * order > 2 * np.pi * LEAST_CYCLES) & (2 * np.pi > SHORTEST_CYCLE * order * np.abs(np.diff(angle)).max())
+    shown = (turned * order > 2 * np.pi * CYCLES_OF_ORDER) & (2 * np.pi > SHORTEST_CYCLE * order * np.abs(np.diff(angle)).max())
     sums, weight = np.zeros((len(order), 3), complex), np.zeros(len(order))
     if shown.any():
         middle = (angle - angle.mean()) / turned
@@ -136,7 +136,7 @@ STEP = 0.1
 """Spacing of the frequencies under test, cycles per second or per turn; its inverse is the largest length of a stretch."""
 PER_TURN = 128
 """Angles per turn at which the residual of a turning joint is sampled."""
-LEAST_CYCLES = 3.0
+CYCLES_OF_TONE = 3.0
 """Of a tone in a stretch that can show it."""
 HIGHEST = 0.45
 """Highest frequency in that of the samples."""
@@ -290,7 +290,7 @@ def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float
     hits, ratios, plain, excess = np.zeros((4, len(grid), 3))
     count = np.zeros(len(grid), int)
     for rest, step, highest in every:
-        inside = (grid * len(rest) * step >= LEAST_CYCLES) & (grid <= highest)
+        inside = (grid * len(rest) * step >= CYCLES_OF_TONE) & (grid <= highest)
         power, around, inside = _powers(rest, round(1 / (STEP * every[0][1])), inside)
         at = np.flatnonzero(inside)
         count[at] += 1

@@ -186,3 +186,11 @@ def test_no_modules_import_each_other(tmp_path):
 def test_modules_of_all_layers_were_found():
     names = set(map(module_name, [*modules('imu_calibration'), *modules('msg_adapters')]))
     assert {'imu_calibration.core.samples', 'imu_calibration.cli', 'imu_calibration.nodes', 'msg_adapters'} <= names
+
+
+@pytest.mark.parametrize('path', modules('imu_calibration') + modules('msg_adapters'), ids=module_name)
+def test_a_module_binds_each_constant_once(path):
+    """Two constants of one name, as after a join of two files, leave the first one's users with the second one's value."""
+    bound = [target.id for node in parsed(path).body if isinstance(node, (ast.Assign, ast.AnnAssign))
+             for target in (node.targets if isinstance(node, ast.Assign) else [node.target]) if isinstance(target, ast.Name)]
+    assert sorted(set(bound)) == sorted(bound)
