@@ -161,12 +161,12 @@ def test_what_cannot_be_published_at_the_end_is_not_printed(name):
 
 
 def test_a_node_without_ros_ends_with_one_line(monkeypatch, capsys):
-    from imu_calibration.nodes import early_end
-    early_end.require_rclpy()   # this process is no node
-    monkeypatch.setattr(early_end, 'is_node_process', lambda: True)
-    monkeypatch.setattr(early_end, 'find_spec', lambda name: None)
+    from imu_calibration import nodes
+    nodes.require_rclpy()   # this process is no node
+    monkeypatch.setattr(nodes, 'is_node_process', lambda: True)
+    monkeypatch.setattr(nodes, 'find_spec', lambda name: None)
     with pytest.raises(SystemExit) as ended:
-        early_end.require_rclpy()
+        nodes.require_rclpy()
     assert ended.value.code == 1 and capsys.readouterr().err.count('\n') == 1
 
 
