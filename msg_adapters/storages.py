@@ -12,7 +12,7 @@ from msg_adapters.storage import Arrived, RawMessages
 
 
 class BagSource(Protocol):
-    """The messages of one recording, independent of its file format: `rosbag2.Rosbag2` or `ros1_file.Ros1File`."""
+    """The messages of one recording, independent of its file format: `rosbag2.Rosbag2` or `bag.Ros1File`."""
 
     ros1: bool
     """Whether the messages are serialized as in ROS 1."""

@@ -2,5 +2,5 @@
 HTML reports.
 
 In: a `CalibrationResult` or a `Diagnosis`. Out: one self-contained HTML page each.
-Read `calibration_page` first.
+Read `calibration_sections` first.
 """

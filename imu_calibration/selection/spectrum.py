@@ -198,7 +198,7 @@ def find_tones(found: Investigation, table: Table, formulas: Sequence[Proposal] 
     The residual of every stretch of at most ten seconds, or of at most ten turns of a joint in steady rotation, is transformed to
     frequencies. A peak has four times the median power around it; a tone has peaks in most stretches, tested against noise
     (binomial law). Rests and motions are both analysed in seconds; a tone at a multiple of a speed is constant per turn and varies per
-    second. Where few stretches turn, integer orders are searched in all motions of the joint (`selection.orders`). Fixed frequencies are
+    second. Where few stretches turn, integer orders are searched in all motions of the joint (`orders_of`). Fixed frequencies are
     removed before multiples of a speed are searched.
     """
     model = found.attempt.recording.model
