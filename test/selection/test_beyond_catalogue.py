@@ -26,6 +26,10 @@ from worlds.beyond_catalogue import row_of
 from worlds.hiding import record
 from worlds.physics_beyond import Beyond
 
+FEW = ('accel_quadratic', 'accel_cubic', 'accel_bias_drift', 'accel_thermal_bias', 'gyro_g_sensitivity', 'gyro_quadratic', 'gyro_bandwidth', 'gyro_bias_drift',
+       'gyro_thermal_bias', 'gyro_thermal_scale', 'time_offset', 'load_compliance')
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 
 @lru_cache(maxsize=None)
 def recorded(kind=None, seed=5):
