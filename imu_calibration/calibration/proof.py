@@ -64,8 +64,8 @@ def prove_solution(held_out: HeldOut, solution: Solution, gathered_model: Sensor
     dealt, model = held_out.restricted(gathered_model, solution.model), solution.model
     nominal = nominal_values(model)
     folds = [applied_values(model, values, centre) for values in dealt.values_without(solution)]
-    described = [_with_reference(model, values, nominal) for values in folds]
-    proof = prove(model, before=(dealt, ([nominal], [_with_reference(model, nominal, solution.values)])), after=(dealt, (folds, described)))
+    described = [with_reference(model, values, nominal) for values in folds]
+    proof = prove(model, before=(dealt, ([nominal], [with_reference(model, nominal, solution.values)])), after=(dealt, (folds, described)))
     if proof and one_attitude([block.accumulator for block in dealt.blocks], model):
         proof['accelerometer']['one_attitude'] = True
     return proof
@@ -78,7 +78,7 @@ def prove_readings(before: HeldOut, after: HeldOut, model: SensorModel, *, refer
     `reference` has the parameters of the table and the clock, shape (n_params,).
     """
     nominal = nominal_values(model)
-    candidates = ([nominal], [_with_reference(model, nominal, reference)])
+    candidates = ([nominal], [with_reference(model, nominal, reference)])
     return prove(model, before=(before, candidates), after=(after, candidates))
 
 
@@ -138,8 +138,8 @@ def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray
     return values
 
 
-def _with_reference(model, values, reference):
-    """Return the values with the table and the clock of other values."""
+def with_reference(model: SensorModel, values: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Return the values with the table and the clock of other values `reference`, shape (n_params,)."""
     values = values.copy()
     for effect in model.effects:
         if _of_reference(effect):

@@ -19,9 +19,8 @@ from imu_calibration.core.progress import report
 from imu_calibration.core.samples import TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import HELPS, decide, reason_of, worse_regimes
-from imu_calibration.document.trust import LAST_SHARE, end_of, uncorrected_on_table
+from imu_calibration.document.trust import end_of, judged_from_of, uncorrected_on_table
 from imu_calibration.effects.base import Role
-from imu_calibration.effects.forward_equations import in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.estimation.solution import Solution, shrunk, tolerances_of
@@ -103,7 +102,7 @@ def solve_in_passes(model: SensorModel, options: CalibrationOptions, solved: Cal
     for _ in range(PASSES):
         model = again
         solution, gathered = solved(model, judged_from)
-        again, last_third = linearise_again(model, solution), judged_from_of(solution.model, gathered)
+        again, last_third = linearise_again(model, solution), judged_from_of(solution.model, end_of(gathered.accumulator))
         if again is None and judged_from == last_third:
             break
         again, judged_from = again or model, last_third
@@ -121,11 +120,6 @@ def _at_time_constants(model, options, solved):
             duration = end_of(solved(model)[1].accumulator)
             model = min(at_time_constants(model, effect, duration), key=lambda trial: solved(trial)[0].residual_rms[effect.sensor][1])
     return model
-
-
-def judged_from_of(model: SensorModel, gathered: Gathered) -> float:
-    """Return the time from which windows are judged, s: that of the last third of the recording where the model has effects in time."""
-    return LAST_SHARE * end_of(gathered.accumulator) if any(map(in_time, not_applied(model))) else 0.0
 
 
 def _first_temperature(sources):

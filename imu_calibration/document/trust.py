@@ -85,6 +85,11 @@ def end_of(accumulator: Accumulator) -> float:
     return max(row.time + row.duration / 2 for row in accumulator.rows)
 
 
+def judged_from_of(model: SensorModel, end: float) -> float:
+    """Return the time from which windows are judged, s: the last third until `end` where the model has effects in time."""
+    return LAST_SHARE * end if any(map(in_time, not_applied(model))) else 0.0
+
+
 def columns_at(model: SensorModel, effect: Effect, times: Sequence[float] | np.ndarray) -> dict[str, np.ndarray]:
     """Return the columns of an effect in time at some times, s: group -> shape (n, width)."""
     nothing = np.zeros((len(times), 3))

@@ -97,7 +97,7 @@ def _tiles(diagnosis):
     if diagnosis.findings:
         gain = diagnosis.gain
         number, _, unit = in_unit(gain.heldout_rms_after, UNIT[gain.sensor]).partition(' ')
-        tiles.append({'what': f'held-out {gain.sensor} residual ({gain.measure})', 'number': number, 'unit': unit,
+        tiles.append({'what': f'{gain.of} ({gain.sensor}, held-out {gain.measure})', 'number': number, 'unit': unit,
                       'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]), 'note': _reduction(gain)})
     navigation = diagnosis.traces.dead_reckoning
     if navigation and diagnosis.findings:
@@ -122,7 +122,7 @@ def _finding(diagnosis, finding, number):
 
 def _gained(gain):
     return {'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]), 'after': in_unit(gain.heldout_rms_after, UNIT[gain.sensor]),
-            'reduction': _reduction(gain), 'sensor': gain.sensor, 'measure': gain.measure}
+            'reduction': _reduction(gain), 'sensor': gain.sensor, 'of': gain.of, 'measure': gain.measure}
 
 
 def _formula(diagnosis, rest):

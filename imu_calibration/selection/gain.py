@@ -13,6 +13,8 @@ RESAMPLES = 1000
 AT_REST = 'means of windows at rest'
 MEASURES = ('samples', 'window means', 'samples about the mean of their window', AT_REST)
 """Residuals of which a gain is reported."""
+APPLIED, OF_MODEL = 'error of corrected readings', 'residual of the model'
+"""Kinds of residuals: of readings as compensation corrects them, relative to the reference, or of raw readings, relative to the model."""
 LEAST_REDUCTION = 0.01
 """
 With an unexplained excess, or without rests, a finding reduces the cross-validated residual by more than this share, with
@@ -36,6 +38,8 @@ class Gain:
     """95 % interval of the reduction, by resampling windows."""
     windows: int
     """Windows that were held out."""
+    of: str = OF_MODEL
+    """`APPLIED` or `OF_MODEL`."""
 
     @property
     def least(self) -> float:

@@ -11,10 +11,14 @@ from scipy.stats import chi2
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
 from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
+from imu_calibration.compensation.compensate import compensate
 from imu_calibration.core.errors import NotObservableError
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.selection.evidence import locked_windows
-from imu_calibration.selection.gain import heldout_gain
+from imu_calibration.selection.gain import APPLIED, OF_MODEL, heldout_gain
 from imu_calibration.selection.investigation import investigate
+from imu_calibration.selection.residual_analysis import inquire
 
 from worlds.hiding import Sizes, record
 
@@ -157,3 +161,28 @@ def test_falls_of_the_loss_are_chi_square_where_nothing_is_hidden(sizes):
                       for q in search.questions if '@' not in q.label])
     # 25 effects, partly dependent: their sum stays near its expectation
     assert 1e-3 < chi2.sf(falls[:, 0].sum(), falls[:, 1].sum()) < 1 - 1e-3
+
+
+def test_the_gain_is_that_of_corrected_readings(sizes):
+    """Two calibrations without the locked windows, applied to these, relative to the table, to 1e-9; the model's residual differs by the scale factors."""
+    recording, diagnosis = seek('accel_quadratic', sizes)
+    found, rms = inquire(recording.windows, recording.table, recording.model), []
+    for chosen in ([], found.named):
+        known = dict(zip(found.attempt.space.names, found.attempt.values(chosen)))
+        model = recording.model.with_effect('accelerometer', 'accel_quadratic') if chosen else recording.model
+        values = np.array([known[name] for name in model.param_names])
+        calibration = Calibration(model, values, np.zeros((len(values),) * 2), ('determined',) * len(values))
+        means = []
+        for window in (window for window, locked in zip(found.used, found.attempt.locked) if locked):
+            ref = reference_motion(recording.table, window.motion)
+            alpha = np.broadcast_to(ref.alpha_s, (len(window), 3))
+            means.append((compensate(calibration, window.force_s, window.rate_s, alpha_s=alpha).force - ref.force_s).mean(axis=0))
+        rms.append(np.sqrt(np.mean(np.square(means))))
+    gain, of_model = diagnosis.findings[0].gain, heldout_gain(found.attempt, [], found.named, sensors=['accelerometer'])
+    assert (gain.of, gain.measure, of_model.measure) == (APPLIED, 'window means', 'window means')
+    assert 1 - gain.reduction == pytest.approx(rms[1] / rms[0], rel=1e-9)
+    assert 1 - of_model.reduction != pytest.approx(rms[1] / rms[0], rel=1e-5)
+
+
+def test_the_gain_of_an_error_of_the_table_is_that_of_the_model(sizes):
+    assert seek('encoder_harmonic', sizes)[1].findings[0].gain.of == OF_MODEL

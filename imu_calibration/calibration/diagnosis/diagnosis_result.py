@@ -169,7 +169,7 @@ def _finding(finding):
 
 
 def _gain(gain):
-    return {'sensor': gain.sensor, 'measure': gain.measure, 'heldout_rms_before': gain.heldout_rms_before,
+    return {'sensor': gain.sensor, 'of': gain.of, 'measure': gain.measure, 'heldout_rms_before': gain.heldout_rms_before,
             'heldout_rms_after': gain.heldout_rms_after, 'reduction': gain.reduction, 'ci95': list(gain.ci95), 'windows': gain.windows}
 
 

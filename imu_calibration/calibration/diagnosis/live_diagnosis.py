@@ -106,7 +106,7 @@ def describe(diagnosis: Diagnosis) -> DiagnosisState:
               **{name: f'{value:.4g} +- {sd:.2g} {unit}' for name, (value, sd, unit) in first.parameters.items()},
               'p-value': f'{first.p_value:.2g}', 'held-out reduction': f'{first.gain.reduction:.3f}',
               'held-out reduction, 95 % interval': f'{low:.3f} to {high:.3f}',
-              'held-out measure': f'{first.gain.sensor} {first.gain.measure}',
+              'held-out measure': f'{first.gain.sensor} {first.gain.measure}, {first.gain.of}',
               'indistinguishable from': ' '.join(first.indistinguishable_from),
               'further findings': ' '.join(finding.effect for finding in diagnosis.findings[1:]),
               'implausible': ' '.join(finding.effect for finding in diagnosis.findings if finding.implausible), **values}

@@ -112,7 +112,7 @@ def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], ga
     when = f' at {values[-1][1]:.1f} s' if effect.located else ''
     text = f'{effect.explanation} Its size is {size}{which}{when}.'
     if gain is not None and gain.reduction > 0:
-        text += f' With it the {gain.sensor} residual of held-out {gain.measure} falls by {_percent(gain.reduction)}.'
+        text += f' With it the {gain.of} ({gain.sensor}, held-out {gain.measure}) falls by {_percent(gain.reduction)}.'
     return text
 
 

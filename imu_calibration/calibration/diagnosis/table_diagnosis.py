@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import extended_solution
+from imu_calibration.calibration.diagnosis.applied_gain import gain_of_findings
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, parameters_of
 from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of_one_joint, sentence, separating_motion
 from imu_calibration.calibration.diagnosis.traces import residual_traces
@@ -16,7 +17,7 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.explained_share import sensors_of
-from imu_calibration.selection.gain import Gain, gain_in_turn, heldout_gain
+from imu_calibration.selection.gain import Gain, gain_in_turn
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.residual_analysis import Examination, inquire
 from imu_calibration.selection.spectrum import find_tones
@@ -81,7 +82,7 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
                                  saturations=limits) if named or limits else baseline
 
     def gain_of(place):
-        return heldout_gain(attempt, named[:place], named[:place + 1], sensors=sensors_of(named[place].effect))
+        return gain_of_findings(found, table, named[:place], named[:place + 1], sensors=sensors_of(named[place].effect))
 
     def shows(place, mate, gain):
         if gain.sensor not in sensors_of(mate.effect):
@@ -105,7 +106,7 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
     return Diagnosis(tuple(findings), rests, candidates_of(attempt.search, named, agree=attempt.windows_agree),
                      tuple(found.not_testable),
-                     baseline, solution, heldout_gain(attempt, [], named, sensors=sensors), len(found.used), int(np.sum(attempt.locked)),
+                     baseline, solution, gain_of_findings(found, table, [], named, sensors=sensors), len(found.used), int(np.sum(attempt.locked)),
                      onset=found.onset)
 
 

@@ -13,7 +13,7 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.strapdown import drift_over
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, all_samples, chunks
-from imu_calibration.selection.gain import MEASURES, Gain, reduction_interval
+from imu_calibration.selection.gain import MEASURES, OF_MODEL, Gain, reduction_interval
 from imu_calibration.selection.saturation import measured
 from imu_calibration.simulation.session import predict_windows
 
@@ -123,17 +123,17 @@ class DistanceSums:
         nearest = np.abs(np.arange(edge - 1)[:, None] - known).argmin(axis=1) if len(known) else []
         noise = density[nearest] * self._freedom[0][:edge - 1, None] if len(known) else np.zeros((edge - 1, 3))
         return Distance(EDGES[:edge], self._power[sensor][:, :edge - 1] / self._samples, noise / self._samples,
-                        self._means[sensor] / self._windows, self._noise[sensor] / self._windows, self._gains(sensor))
+                        self._means[sensor] / self._windows, self._noise[sensor] / self._windows, self.gains(sensor))
 
-    def _gains(self, sensor):
-        """Return measure -> Gain, in the order of `MEASURES`."""
+    def gains(self, sensor: str, of: str = OF_MODEL) -> dict[str, Gain]:
+        """Return measure -> Gain of the windows up to now, in the order of `MEASURES`."""
         n, rest, *squares = np.array(self._rows[sensor]).T
         models, still, found = (squares[:2], squares[2:]), rest > 0, {}
         pairs = ([(within + n * mean, 3 * n) for within, mean in models], [(mean, 0 * n + 3) for _, mean in models],
                  [(within, 3 * (n - 1)) for within, _ in models], [(mean[still], 3 + 0 * mean[still]) for _, mean in models])
         for measure, pair in zip(MEASURES, pairs):
             rms = [float(np.sqrt(total.sum() / max(number.sum(), 1))) for total, number in pair]
-            found[measure] = Gain(sensor, measure, *rms, reduction_interval(pair), len(pair[0][0]))
+            found[measure] = Gain(sensor, measure, *rms, reduction_interval(pair), len(pair[0][0]), of)
         return found
 
 

@@ -1,0 +1,83 @@
+"""Gain of an extension of the model: errors of the corrected readings of held-out windows."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from imu_calibration.calibration.diagnosis.traces import DistanceSums
+from imu_calibration.calibration.proof import nominal_values, with_reference
+from imu_calibration.compensation.compensate import compensate
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.trust import judged_from_of, uncorrected_on_table
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.forward_equations import applied_values, not_applied, sensor_output, warped_reference
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import HELD
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window, all_samples, chunks
+from imu_calibration.selection.gain import APPLIED, Gain, gain_in_turn, heldout_gain
+from imu_calibration.selection.investigation import Investigation
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.saturation import measured
+
+
+def gain_of_findings(found: Investigation, table: Table, before: Sequence[Question], after: Sequence[Question], *,
+                     sensors: Sequence[str]) -> Gain:
+    """
+    Return the Gain of the findings `after` over the findings `before` on the locked windows.
+
+    The residual is the error of the readings that compensation returns, relative to the reference that each side estimates; both sides
+    are estimated from the other windows. If no additional finding can be compensated, the residual is that of the model
+    (`gain.heldout_gain`). Sensor and measure are chosen on the other windows.
+
+    Parameters
+    ----------
+    found : Investigation
+    table : Table
+    before, after : sequence of Question
+    sensors : sequence of str
+        Sensors that the difference acts on.
+
+    """
+    attempt, applied = found.attempt, [[question for question in some if question in found.adopted] for some in (before, after)]
+    if not any(question.effect.compensation == 'exact' for question in applied[1] if question not in applied[0]):
+        return heldout_gain(attempt, before, after, sensors=sensors)
+    chosen = gain_in_turn(attempt, *applied, sensors=sensors)
+    sides, sums = [applied_parameters(found, some) for some in applied], DistanceSums()
+    start = max(judged_from_of(model, attempt.duration) for model, *_ in sides)
+    held_out = [window for window, locked in zip(found.used, attempt.locked) if locked and window.time[0] >= start]
+    for group in chunks(held_out):
+        for window, *residuals in zip(group, *(_errors(group, table, *side) for side in sides)):
+            sums.add(window, residuals, attempt.noise)
+    return sums.gains(chosen.sensor, APPLIED)[chosen.measure]
+
+
+def applied_parameters(found: Investigation, chosen: Sequence[Question]) -> tuple[SensorModel, np.ndarray, np.ndarray]:
+    """Return (model, values, values as compensation applies them) of a choice of effects, estimated without the locked windows."""
+    attempt, wide = found.attempt, found.attempt.recording.model
+    model = replace(attempt.baseline, temperature_ref_c=wide.temperature_ref_c)
+    for question in chosen:
+        model = model.with_effect(question.sensor, question.name)
+    known = attempt.values(chosen)
+    values = np.concatenate([known[wide.slices[effect.key]] for effect in model.effects])
+    model = model.at(values)
+    centre = uncorrected_on_table(model, values, attempt.recording.accumulated(wide), gathered=wide).centre if not_applied(model) else {}
+    return model, values, applied_values(model, values, centre)
+
+
+def _errors(windows, table, model, values, applied):
+    """Yield sensor -> error of the corrected readings of each window, m/s^2 and rad/s, shape (n, 3)."""
+    motion, temperature, rows = all_samples(windows)
+    ideal = with_reference(model, nominal_values(model), values)
+    refs = [warped_reference(model.at(ideal), sensor, table, motion=motion, temperature_c=temperature) for sensor in SENSORS]
+    ref = refs[1].select(rows)
+    raw = [np.concatenate([measured(window, sensor) for window in windows]) for sensor in SENSORS]
+    known = Calibration(model, applied, np.zeros((len(values),) * 2), (HELD,) * len(values))
+    corrected = compensate(known, *raw, alpha_s=ref.alpha_s, temperature_c=ref.temperature_c, thermal_branch=ref.thermal_branch,
+                           vibration=ref.vibration)
+    errors = [true - sensor_output(model.at(ideal), sensor, ideal, ref=own)[rows]
+              for true, sensor, own in zip((corrected.force, corrected.rate), SENSORS, refs)]
+    for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
+        yield {sensor: error[start:stop] for sensor, error in zip(SENSORS, errors)}
