@@ -15,6 +15,7 @@ import numpy as np
 
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.effects.base import AXES
+from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.choices import catalogue_of
 from imu_calibration.use_cases.diagnose import diagnose
 from imu_calibration.use_cases.simulate import replay, simulate
@@ -65,6 +66,15 @@ def sizes_of(found):
     return sizes
 
 
+def values_of(calibration):
+    """Return {effect: {parameter: value}} of a calibration."""
+    model, found = calibration.model, {}
+    for effect in model.effects:
+        part = model.slices[effect.key]
+        found[effect.name] = dict(zip(model.param_names[part], calibration.values[part].tolist()))
+    return found
+
+
 def compared(expected, calibration, measured, seed):
     """Simulate a calibration on the motion of a session, diagnose the simulation and compare with {name: {parameter: value}}."""
     second = diagnose(replay(measured.samples, calibration, measured.table, seed=seed).samples, measured.table)
@@ -78,22 +88,17 @@ def compared(expected, calibration, measured, seed):
     return {'found': sorted(expected), 'again': sorted(again), 'new': sorted(name for name in found if not classes[name] & expected.keys()), 'z': z}
 
 
-def exchanged(calibration, finding, mate):
-    """Return the calibration with `mate` at its estimated size in the place of a finding, or None where it has no size."""
-    sizes = finding.sizes_of_mates.get(mate)
-    if not sizes:
-        return None
+def exchanged(calibration, finding, mate, measured):
+    """
+    Return the calibration of a session with `mate` in the place of a finding, or None where it is not determined.
+
+    All parameters are estimated with it: a drift in place of a thermal bias needs another bias.
+    """
     model, sensor = calibration.model, catalogue_of(None).owner_of(mate)
     less = replace(model, point={}, **{finding.sensor: tuple(name for name in getattr(model, finding.sensor) if name != finding.effect)})
-    wider = less.with_effect(sensor, mate)
-    values = wider.start_from(model, calibration.values)
-    names = wider.param_names
-    for name, (value, _) in sizes.items():
-        if name not in names:
-            return None
-        values[names.index(name)] = value
-    return replace(calibration, model=replace(wider, point={}), values=values, covariance=np.zeros((len(values),) * 2),
-                   status=(calibration.status[0],) * len(values))
+    names = {f'{part}_model': '+'.join(getattr(less.with_effect(sensor, mate), part)) or 'none' for part in ('accelerometer', 'gyroscope', 'reference')}
+    other = calibrate(measured.samples, measured.table, model_as_asked=True, **names).calibration
+    return other if 'held' not in np.array(other.status)[other.model.slices[sensor, mate]] else None
 
 
 def run(names, seed):
@@ -109,12 +114,11 @@ def run(names, seed):
                          | compared(sizes, first.proposed or first.calibration, measured, seed + 1000))
             for finding in first.findings:
                 for mate in finding.indistinguishable_from:
-                    other = exchanged(first.calibration, finding, mate)
+                    other = exchanged(first.calibration, finding, mate, measured)
                     if other is not None:
-                        others = {effect: own for effect, own in sizes.items() if effect != finding.effect}
-                        mates = {part: value for part, (value, _) in finding.sizes_of_mates[mate].items()}
+                        expected = {name: own for name, own in values_of(other).items() if name == mate or name in sizes}
                         found.append({'cause': f'{mate} for {finding.effect}', 'kind': 'pair'}
-                                     | compared(others | {mate: mates}, other, measured, seed + 2000))
+                                     | compared(expected, other, measured, seed + 2000))
         except ImuCalibrationError as error:
             found.append({'cause': name, 'kind': 'refused', 'found': [], 'again': [], 'new': [], 'z': [], 'why': str(error)})
         for row in found:

@@ -12,7 +12,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import clip, predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.signal_history import HALF_WIDTH
+from imu_calibration.kinematics.signal_history import HALF_WIDTH, BandVariance
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, WindowKind, all_samples, chunks
 from imu_calibration.preprocessing.window_finder import MotionGatherer
@@ -40,7 +40,18 @@ def hum_and_variance(time: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndar
 
     """
     loudness = LOUDEST * np.array(GEARS)[(np.asarray(time) // HOLD).astype(int) % len(GEARS)][:, None]
-    return np.sqrt(2.0) * loudness * np.sin(2 * np.pi * ALIASED * rate * time[:, None] + np.arange(3.0)), np.tile(loudness**2, 3)
+    return loudness * _unit_hum(time, rate), np.tile(loudness**2, 3)
+
+
+def _unit_hum(time, rate):
+    """Return a sine of unit variance on each axis, shape (n, 3)."""
+    return np.sqrt(2.0) * np.sin(2 * np.pi * ALIASED * rate * time[:, None] + np.arange(3.0))
+
+
+def hum_of(variance: np.ndarray, period: float) -> np.ndarray:
+    """Return a vibration, m/s^2, of which `BandVariance` measures the variance of a recording, (m/s^2)^2, both shape (n, 3)."""
+    unit = _unit_hum(period * np.arange(len(variance)), 1.0 / period)
+    return unit * np.sqrt(variance / BandVariance().of(period, unit)[-1])
 
 
 START_NS = 1_700_000_000_000_000_000
@@ -259,11 +270,15 @@ def replay(blocks: Iterable[SampleBlock], table: Table, model: SensorModel, *, v
     stamps = np.concatenate([window.stamp_ns for window in windows])
     period = float(np.median([window.period for window in windows if len(window) > 1] or [1.0]))
     noise, rng = noise or noise_at_rest(windows), np.random.default_rng([seed, 3])
+    exact = {sensor: np.concatenate([output[sensor] for output in outputs]) for sensor in SENSORS}
+    if model.uses('vibration'):   # biases follow the vibration of the readings
+        known = [motion.vibration[rows] for motion, _, rows in map(all_samples, chunks(windows))]
+        exact['accelerometer'] += hum_of(np.concatenate(known), period)
     readings = []
     for sensor in SENSORS:
-        own, exact = noise[sensor], np.concatenate([output[sensor] for output in outputs])
-        noisy = exact + rng.normal(0.0, own.white_sd, exact.shape)
-        noisy += gauss_markov(own.bias_sd, own.bias_time, period, shape=exact.shape, rng=rng)
+        own, shape = noise[sensor], exact[sensor].shape
+        noisy = exact[sensor] + rng.normal(0.0, own.white_sd, shape)
+        noisy += gauss_markov(own.bias_sd, own.bias_time, period, shape=shape, rng=rng)
         readings.append(clip(model, sensor, values, output=noisy))
     frame = next(block.imu.frame_id for block in blocks if block.imu is not None and len(block.imu))
     joints, temperature = (_joined([getattr(block, name) for block in blocks]) for name in ('joints', 'temperature'))

@@ -10,6 +10,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.kinematics.signal_history import BandVariance
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
 from imu_calibration.simulation.session import ReplayNoise, SimulationOptions, random_values, replay, simulate
@@ -61,6 +62,19 @@ def test_without_noise_in_the_calibration_that_at_rest_is_taken(session):
     noisy = replace(samples, imu=replace(samples.imu, rate_s=samples.imu.rate_s + rng.normal(0, 1e-3, samples.imu.rate_s.shape)))
     quiet, made = (replay([noisy], table, MODEL, values=values, noise=noise)[0].imu for noise in (QUIET, None))
     np.testing.assert_allclose((made.rate_s - quiet.rate_s).std(axis=0), 1e-3, rtol=0.05)
+
+
+def test_a_replay_vibrates_as_its_recording(session):
+    """Biases follow the vibration of the readings: gears of 11 s and half a second of memory, smoothed twice."""
+    table, model = session[1], MODEL.with_effect('accelerometer', 'accel_vibration_rectification')
+    values = model.start_from(MODEL, session[2])
+    options = SimulationOptions(noise=SimulatedNoise(), temperature_start_c=25.0)
+    samples = SampleBlock(*simulate(model, values, table, profile=make_profile('quick', 3, table), options=options, seed=3))
+    made = replay([samples], table, model, values=values, noise=QUIET)[0].imu
+    recorded, replayed = (BandVariance().of(0.01, each.force_s)[500:] for each in
+                          (samples.imu.select(np.isin(samples.imu.stamp_ns, made.stamp_ns)), made))
+    np.testing.assert_allclose(replayed.mean(axis=0), recorded.mean(axis=0), rtol=0.03)
+    assert min(np.corrcoef(a, b)[0, 1] for a, b in zip(recorded.T, replayed.T)) > 0.97
 
 
 def test_what_a_replay_requires(session):
