@@ -19,6 +19,7 @@ from imu_calibration.estimation.solution import LACKING
 from imu_calibration.kinematics.rotations import Reference
 
 END, MEAN = 'end of the recording', 'mean of the recording'
+AGAIN = '; it is proven for its last third only, and the error returns where the effect starts again'
 LAST_SHARE = 2.0 / 3.0
 """Effects in time are proven on the windows after this share of the recording: the value at its end is applied."""
 
@@ -108,7 +109,7 @@ def uncorrected_lines(statistics: Mapping[str, Any]) -> list[str]:
     for entry in statistics.get('uncorrected') or ():
         size = error_text(max(entry['rms']), entry['unit'])
         lines.append(f'{entry["effect"]} is not corrected: the {entry["sensor"]} bias has its value at the {entry["applied"]}, '
-                     f'with an error of {size} rms during the recording')
+                     f'with an error of {size} rms during the recording{AGAIN if entry["applied"] == END else ""}')
     return lines
 
 
