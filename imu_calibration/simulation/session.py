@@ -272,7 +272,7 @@ def replay(blocks: Iterable[SampleBlock], table: Table, model: SensorModel, *, v
     noise, rng = noise or noise_at_rest(windows), np.random.default_rng([seed, 3])
     exact = {sensor: np.concatenate([output[sensor] for output in outputs]) for sensor in SENSORS}
     if model.uses('vibration'):   # biases follow the vibration of the readings
-        known = [motion.vibration[rows] for motion, _, rows in map(all_samples, chunks(windows))]
+        known = [np.asarray(motion.vibration)[rows] for motion, _, rows in map(all_samples, chunks(windows))]
         exact['accelerometer'] += hum_of(np.concatenate(known), period)
     readings = []
     for sensor in SENSORS:

@@ -16,7 +16,7 @@ from imu_calibration.effects.forward_equations import applied_values, not_applie
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window, all_samples, chunks
+from imu_calibration.preprocessing.window import all_samples, chunks
 from imu_calibration.selection.gain import APPLIED, Gain, gain_in_turn, heldout_gain
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.questions import Question

@@ -105,9 +105,8 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
     return Diagnosis(tuple(findings), rests, candidates_of(attempt.search, named, agree=attempt.windows_agree),
-                     tuple(found.not_testable),
-                     baseline, solution, gain_of_findings(found, table, [], named, sensors=sensors), len(found.used), int(np.sum(attempt.locked)),
-                     onset=found.onset)
+                     tuple(found.not_testable), baseline, solution, gain_of_findings(found, table, [], named, sensors=sensors),
+                     len(found.used), int(np.sum(attempt.locked)), onset=found.onset)
 
 
 def _rivals(found, question):
