@@ -133,7 +133,7 @@ class DistanceSums:
                  [(within, 3 * (n - 1)) for within, _ in models], [(mean[still], 3 + 0 * mean[still]) for _, mean in models])
         for measure, pair in zip(MEASURES, pairs):
             rms = [float(np.sqrt(total.sum() / max(number.sum(), 1))) for total, number in pair]
-            found[measure] = Gain(sensor, measure, *rms, reduction_interval(pair), len(pair[0][0]), of)
+            found[measure] = Gain(sensor, measure, rms[0], rms[1], reduction_interval(pair), len(pair[0][0]), of)
         return found
 
 
