@@ -23,7 +23,7 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.saturation import measured
 
 
-def gain_of_findings(found: Investigation, table: Table, before: Sequence[Question], after: Sequence[Question], *,
+def gain_of_findings(found: Investigation, table: Table, before: Sequence[Question], *, after: Sequence[Question],
                      sensors: Sequence[str]) -> Gain:
     """
     Return the Gain of the findings `after` over the findings `before` on the locked windows.

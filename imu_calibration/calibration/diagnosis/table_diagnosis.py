@@ -82,7 +82,7 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
                                  saturations=limits) if named or limits else baseline
 
     def gain_of(place):
-        return gain_of_findings(found, table, named[:place], named[:place + 1], sensors=sensors_of(named[place].effect))
+        return gain_of_findings(found, table, named[:place], after=named[:place + 1], sensors=sensors_of(named[place].effect))
 
     def shows(place, mate, gain):
         if gain.sensor not in sensors_of(mate.effect):
@@ -105,7 +105,7 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
     return Diagnosis(tuple(findings), rests, candidates_of(attempt.search, named, agree=attempt.windows_agree),
-                     tuple(found.not_testable), baseline, solution, gain_of_findings(found, table, [], named, sensors=sensors),
+                     tuple(found.not_testable), baseline, solution, gain_of_findings(found, table, [], after=named, sensors=sensors),
                      len(found.used), int(np.sum(attempt.locked)), onset=found.onset)
 
 
