@@ -23,7 +23,6 @@ from imu_calibration.effects.forward_equations import (
     columns,
     predict,
     sensor_output,
-    warped_reference,
 )
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import sessions_of
@@ -132,7 +131,8 @@ def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.n
     Summed over windows: the shift of the estimate when all windows err together. A shift is estimate minus truth.
     """
     solution = result.solution
-    pieces = [_piece(result, changes, *source) for source in _sources(result)]
+    slopes = {sensor: coefficient_jacobian(solution.model, sensor, solution.values) for sensor in SENSORS}
+    pieces = [_piece(result, changes, slopes, *source) for source in _sources(result)]
     free = ~fixed_parameters(solution.model) & ~solution.held
     prior = make_prior(solution.model)
     normal = prior.root.T @ prior.root
@@ -194,18 +194,17 @@ def _sources(result):
         yield window.kind, float(window.time.mean()), 0, len(window), stride, window.motion.select(some), temperature
 
 
-def _piece(result, changes, kind, time, session, count, stride, motion, temperature):
+def _piece(result, changes, slopes, kind, time, session, count, stride, motion, temperature):
     model, values, table = result.solution.model, result.solution.values, result.table
     temperature = _known(model, motion, temperature)
     parts = {name: {} for name in ('mean', 'within', 'change', 'within_change')}
     references = References(model, table, motion, temperature_c=temperature)
+    changed = [References(model, *change(table, motion), temperature_c=temperature) for change in changes]
     for sensor in SENSORS:
-        ref = references.at(sensor)
-        design = columns(model, sensor, table, motion=motion, temperature_c=temperature, references=references)
-        slope = coefficient_jacobian(model, sensor, values)
-        output = sensor_output(model, sensor, values, ref=ref)
-        moved = np.array([_output(model, sensor, values, *change(table, motion),
-                                  temperature) - output for change in changes]).reshape(-1, len(motion), 3)
+        design, slope = columns(model, sensor, table, motion=motion, temperature_c=temperature, references=references), slopes[sensor]
+        output = sensor_output(model, sensor, values, ref=references.at(sensor))
+        moved = [sensor_output(model, sensor, values, ref=each.at(sensor)) - output for each in changed]
+        moved = np.array(moved).reshape(-1, len(motion), 3)
         mean = design.mean(axis=0)
         parts['mean'][sensor] = np.einsum('q,qap->ap', mean, slope)
         parts['change'][sensor] = moved.mean(axis=1)
@@ -221,10 +220,6 @@ def _piece(result, changes, kind, time, session, count, stride, motion, temperat
 def _known(model, motion, temperature):
     """Return temperatures if the model needs them; the mean at rest is not kept, so that the reference temperature is used there."""
     return np.full(len(motion), model.temperature_ref_c) if model.needs_temperature and temperature is None else temperature
-
-
-def _output(model, sensor, values, table, motion, temperature):
-    return sensor_output(model, sensor, values, ref=warped_reference(model, sensor, table, motion=motion, temperature_c=temperature))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
