@@ -22,7 +22,7 @@ if __name__ == '__main__':
 from rosbags.highlevel import AnyReader  # noqa: E402
 
 from benchmarks.bags import long_session, write_bench_bag  # noqa: E402
-from imu_calibration.use_cases.choices import config_file  # noqa: E402
+from imu_calibration.use_cases.resources import config_file  # noqa: E402
 
 REPETITIONS = 5
 MINUTES = 60.0

@@ -24,7 +24,7 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Write the file, print the layout to open it with and the missing parts; return the exit code."""
-    from imu_calibration.use_cases.choices import config_file
+    from imu_calibration.use_cases.resources import config_file
     from imu_calibration.use_cases.view import foxglove, view
     foxglove()   # before the work, not after it
     layout = config_file('view.foxglove.json')

@@ -36,8 +36,8 @@ from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of,
 from imu_calibration.nodes.session_files import SessionFiles, reference_of
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.use_cases.choices import config_file
 from imu_calibration.use_cases.provenance import provenance_with
+from imu_calibration.use_cases.resources import config_file
 from msg_adapters.live import LiveGatherer
 from msg_adapters.write import encode_imu, rows
 

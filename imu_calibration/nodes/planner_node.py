@@ -54,7 +54,7 @@ from imu_calibration.planning.repertoire import up_at
 from imu_calibration.planning.situation import expected_noise, require_grade
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.use_cases.choices import config_file
+from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import joint_row
 from msg_adapters.layout import UnusableMessage
 
@@ -354,16 +354,6 @@ class PlannerNode(Node):
         return drive_statuses(self.driver, self.worker, self._command.name, faults=self._joints.faults() + self._calibrations.faults())
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node; return the exit code."""
-    return run_node(PlannerNode, arguments, hints=HINTS['planner_node'])
-
-
-if __name__ == '__main__':
-    sys.exit(main())
-
-
-
 def drive_statuses(driver: Driver, worker: PlannerWorker, commands: str, *, faults: list[str]) -> list:
     """Return the DiagnosticStatus of the drive; `commands`: topic or action of the trajectories, `faults`: lines about the inputs."""
     name, excess = worker.worst
@@ -379,3 +369,12 @@ def drive_statuses(driver: Driver, worker: PlannerWorker, commands: str, *, faul
     text = '; '.join([worker.doing or f'{driver.state}: {driver.reason}', *faults])
     level = DiagnosticStatus.ERROR if driver.state == DriveState.STOPPED else WARN if faults else OK
     return [make_status(level, 'drive', text, values=values)]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node; return the exit code."""
+    return run_node(PlannerNode, arguments, hints=HINTS['planner_node'])
+
+
+if __name__ == '__main__':
+    sys.exit(main())

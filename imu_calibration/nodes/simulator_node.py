@@ -40,7 +40,7 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import CAUSES, GRADES, hidden_causes
 from imu_calibration.simulation.session import SimulationOptions, random_values
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
-from imu_calibration.use_cases.choices import config_file
+from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import trajectory_from_message
 from msg_adapters.write import encode_imu, encode_joints, encode_temperature, rows
 

@@ -11,8 +11,9 @@ from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.choices import Choices, config_file
+from imu_calibration.use_cases.choices import Choices
 from imu_calibration.use_cases.recordings import provenance_of
+from imu_calibration.use_cases.resources import config_file
 from imu_calibration.use_cases.stand import Arm, Stand
 
 LABELS = ('serial', 'operator')

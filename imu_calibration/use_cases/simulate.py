@@ -26,8 +26,9 @@ from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import BIAS_TIME, ReplayNoise, SimulationOptions, hidden_effect, random_values
 from imu_calibration.simulation.session import replay as run_replay
 from imu_calibration.simulation.session import simulate as run_session
-from imu_calibration.use_cases.choices import Choices, catalogue_of, check_names, config_file, topics_of
+from imu_calibration.use_cases.choices import Choices, catalogue_of, check_names, topics_of
 from imu_calibration.use_cases.recordings import name_of, source_of
+from imu_calibration.use_cases.resources import config_file
 from imu_calibration.use_cases.stand import LIKELY_LINK, Arm, Stand, table_of
 
 

@@ -15,7 +15,7 @@ from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
-from imu_calibration.use_cases.choices import config_file
+from imu_calibration.use_cases.resources import config_file
 
 TABLE = Table.from_mapping(yaml.safe_load(config_file('table_simulated.yaml').read_text(encoding='utf-8')))
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names))

@@ -18,7 +18,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
-from imu_calibration.use_cases.choices import config_file
+from imu_calibration.use_cases.resources import config_file
 from msg_adapters.write import write_session
 
 TABLE_FILE = config_file('table_simulated.yaml')

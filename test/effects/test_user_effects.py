@@ -178,7 +178,7 @@ def test_whatever_a_file_says_it_does_arithmetic_or_nothing():
 @pytest.mark.live
 def test_the_node_reads_the_file(mine):
     program = ('import sys, rclpy\nfrom imu_calibration.nodes.calibration_node import CalibrationNode\n'
-               'from imu_calibration.use_cases.choices import config_file\n'
+               'from imu_calibration.use_cases.resources import config_file\n'
                'given = {"effects_file": sys.argv[1], "table_file": config_file("table_simulated.yaml"),\n'
                '         "gyroscope_model": "bias+matrix+gyro_warm_force"}\n'
                'rclpy.init(args=["--ros-args", *(part for name, value in given.items() for part in ("-p", f"{name}:={value}"))])\n'

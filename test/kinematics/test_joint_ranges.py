@@ -16,7 +16,7 @@ from imu_calibration.planning.planner import NextMotion, make_planner
 from imu_calibration.planning.situation import noise_of_grade
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.table_controller import excess, trajectory_from
-from imu_calibration.use_cases.choices import config_file
+from imu_calibration.use_cases.resources import config_file
 
 from worlds.arms import SIX_AXES
 

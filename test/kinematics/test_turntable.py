@@ -17,7 +17,7 @@ from imu_calibration.kinematics.joint import TYPES, Joint, Mimic
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.rotations import earth_rate_n, normal_gravity, skew
 from imu_calibration.kinematics.table import Table, axis_error_directions
-from imu_calibration.use_cases.choices import config_file
+from imu_calibration.use_cases.resources import config_file
 
 THREE_AXES = {'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
               'gravity': 9.81}

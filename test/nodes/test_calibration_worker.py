@@ -12,7 +12,7 @@ from imu_calibration.nodes.calibration_worker import IDLE, CalibrationWorker
 from imu_calibration.nodes.diagnosis_thread import Listeners
 from imu_calibration.nodes.session_files import SessionFiles
 from imu_calibration.preprocessing.stream_watch import SILENT_AFTER
-from imu_calibration.use_cases.choices import config_file
+from imu_calibration.use_cases.resources import config_file
 
 from worlds.physics import make_session
 

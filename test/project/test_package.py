@@ -18,7 +18,7 @@ import imu_calibration
 from imu_calibration.cli.parser import VERBS
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.use_cases import choices
+from imu_calibration.use_cases import resources
 
 ROOT = Path(__file__).resolve().parents[2]
 EXECUTABLES = {'imu_calibration', 'calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node'}
@@ -101,7 +101,7 @@ def distribution(requirement):
 
 @pytest.mark.live
 def test_manifest_set_up_and_module_agree(manifest, installed):
-    assert manifest.name == installed['name'] == choices.PACKAGE
+    assert manifest.name == installed['name'] == resources.PACKAGE
     assert manifest.version == installed['version'] == imu_calibration.__version__
     assert manifest.licenses[0] == installed['license'] == 'Apache-2.0'
     assert (ROOT / manifest.licenses[0].file).is_file()
@@ -218,28 +218,28 @@ def test_links_of_the_documents_lead_somewhere():
 
 
 def test_config_files_are_found_in_the_checkout():
-    assert choices.share_folder() == ROOT
-    assert choices.config_file('tolerances.yaml') == ROOT / 'config' / 'tolerances.yaml'
+    assert resources.share_folder() == ROOT
+    assert resources.config_file('tolerances.yaml') == ROOT / 'config' / 'tolerances.yaml'
 
 
 def test_an_unknown_config_file_is_refused_with_those_there_are():
     with refused(InputError, 'config_file_unknown', 'nothing.yaml', 'tolerances.yaml'):
-        choices.config_file('nothing.yaml')
+        resources.config_file('nothing.yaml')
 
 
 @pytest.mark.parametrize('layout', ['lib/python3.11/site-packages', 'local/lib/python3.12/dist-packages'])
 def test_an_installation_answers_for_itself(tmp_path, monkeypatch, layout):
     def share(prefix):
-        (prefix / 'share' / choices.PACKAGE / 'config').mkdir(parents=True)
-        (prefix / 'share' / choices.PACKAGE / 'package.xml').touch()
-        return prefix / 'share' / choices.PACKAGE
+        (prefix / 'share' / resources.PACKAGE / 'config').mkdir(parents=True)
+        (prefix / 'share' / resources.PACKAGE / 'package.xml').touch()
+        return prefix / 'share' / resources.PACKAGE
 
     own, other = share(tmp_path / 'own'), share(tmp_path / 'other')
     monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path / 'other'))
-    monkeypatch.setattr(choices, '__file__', str(tmp_path / 'own' / layout / choices.PACKAGE / 'choices.py'))
-    assert choices.share_folder() == own
-    monkeypatch.setattr(choices, '__file__', str(tmp_path / 'elsewhere' / choices.PACKAGE / 'choices.py'))
-    assert choices.share_folder() == other
+    monkeypatch.setattr(resources, '__file__', str(tmp_path / 'own' / layout / resources.PACKAGE / 'resources.py'))
+    assert resources.share_folder() == own
+    monkeypatch.setattr(resources, '__file__', str(tmp_path / 'elsewhere' / resources.PACKAGE / 'resources.py'))
+    assert resources.share_folder() == other
 
 
 def test_the_tolerances_file_covers_the_catalogue_with_its_defaults():

@@ -15,7 +15,7 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
 from imu_calibration.simulation.session import ReplayNoise, SimulationOptions, random_values, replay, simulate
 from imu_calibration.use_cases import simulate as use_case
-from imu_calibration.use_cases.choices import config_file
+from imu_calibration.use_cases.resources import config_file
 
 MODEL = SensorModel(('bias', 'matrix', 'accel_size_effect', 'accel_thermal_bias'), ('bias', 'matrix', 'gyro_g_sensitivity'))
 QUIET = {sensor: ReplayNoise(np.zeros(3), np.zeros(3)) for sensor in ('accelerometer', 'gyroscope')}
