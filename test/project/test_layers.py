@@ -183,6 +183,14 @@ def test_no_modules_import_each_other(tmp_path):
     assert [sorted(found) for found in weigh.cycles(weigh.imports(tmp_path, list(tmp_path.glob('*.py'))))] == [['first', 'second']]
 
 
+def test_the_start_of_a_program_is_the_last_statement_of_its_module():
+    """A function below it is missing while the program runs."""
+    starts = {path: [node.test for node in ast.parse(path.read_text()).body if isinstance(node, ast.If)] for path in modules('imu_calibration')}
+    guarded = {path: ast.parse(path.read_text()).body for path, tests in starts.items() if any('__main__' in ast.unparse(test) for test in tests)}
+    assert len(guarded) >= 5
+    assert [path.name for path, body in guarded.items() if not (isinstance(body[-1], ast.If) and '__main__' in ast.unparse(body[-1].test))] == []
+
+
 def test_modules_of_all_layers_were_found():
     names = set(map(module_name, [*modules('imu_calibration'), *modules('msg_adapters')]))
     assert {'imu_calibration.core.samples', 'imu_calibration.cli', 'imu_calibration.nodes', 'msg_adapters'} <= names
