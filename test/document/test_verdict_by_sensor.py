@@ -122,7 +122,7 @@ def test_check_says_which_sensor_it_helps(yaw, block):
     values = yaw.calibration.values.copy()
     values[yaw.calibration.model.part('accelerometer', Role.OFFSET)] += 0.1
     found = imu.check(block, replace(yaw.calibration, values=values), Table.from_mapping(VERTICAL))
-    assert list(found.result.helped) == ['gyroscope'] and found.exit_code == 3
+    assert list(found.helped) == ['gyroscope'] and found.exit_code == 3
     first, *lines = str(found).splitlines()
     assert 'gyroscope' in first and 'accelerometer' not in first and any('gyroscope' in line and HELPS in line for line in lines)
 
@@ -142,7 +142,7 @@ def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
     assert found.calibration.decisions['gyroscope'] is HELPS and found.calibration.decisions['accelerometer'] is UNPROVEN and found.exit_code == 3
     used = trust.usable(replace(found.calibration, decision={'accelerometer': 'harms', 'gyroscope': 'helps'}))
     here = imu.check(second, found.calibration, table)
-    assert list(here.result.helped) == ['accelerometer', 'gyroscope'] and here.proof['gyroscope']['after'] < 0.6 * here.proof['gyroscope']['before']
+    assert list(here.helped) == ['accelerometer', 'gyroscope'] and here.proof['gyroscope']['after'] < 0.6 * here.proof['gyroscope']['before']
     left = imu.check(second, used.calibration, table).proof
     assert left['accelerometer']['after'] == pytest.approx(left['accelerometer']['before'], rel=0.02)
     assert left['gyroscope']['after'] == pytest.approx(here.proof['gyroscope']['after'], rel=0.02)

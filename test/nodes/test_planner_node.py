@@ -325,7 +325,8 @@ def test_a_class_that_the_six_faces_leave_is_driven_apart_and_a_node_that_ends_l
     from imu_calibration.nodes.inputs import latched_qos
     with Loop(tmp_path / 'out.txt') as loop:
         # A finding that joins the calibration widens what it is mixed up with, and the motions for that part the class on their way.
-        loop.begin(tmp_path, {'stall_patience': 30.0, 'silence': 10.0, 'first_speed': 0.1}, {'model_as_asked': True}, profile='six_faces', hide='soft_spring', hide_size=1.8, seed=1, time_factor=8.0,
+        loop.begin(tmp_path, {'stall_patience': 30.0, 'silence': 10.0, 'first_speed': 0.1, 'imu_rate': 100.0}, {'model_as_asked': True}, profile='six_faces',
+                   hide='soft_spring', hide_size=1.8, seed=1, time_factor=8.0, imu_rate=100.0, joint_rate=100.0,   # the class is found at this rate
                    wait_for_subscribers=1)
         places, words = [], []
         loop.node.create_subscription(MarkerArray, 'imu/coverage', lambda m: words.extend(each.text for each in m.markers if each.ns == 'driven' and each.text),
