@@ -218,6 +218,13 @@ class SensorModel:
         """Return the model extended by one effect."""
         return replace(self, **{sensor: getattr(self, sensor) + (name,)})
 
+    def with_sized_effect(self, values: np.ndarray, sensor: str, name: str, *, size: np.ndarray) -> tuple['SensorModel', np.ndarray]:
+        """Return (the model extended by one effect, its parameters): `values` of this model, and the parameters `size` of the effect."""
+        model = self.with_effect(sensor, name)
+        extended = model.start_from(self, values)
+        extended[model.slices[sensor, name]] = size
+        return model, extended
+
     def with_role(self, sensor: str, role: Role) -> 'SensorModel':
         """Return the model extended by the catalogue's effect for a place of a sensor's equation."""
         effects = self.catalogue.effects(self.joint_names).values()

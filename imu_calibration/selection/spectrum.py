@@ -203,11 +203,10 @@ def find_tones(found: Investigation, table: Table, formulas: Sequence[Proposal] 
     """
     model = found.attempt.recording.model
     values = found.attempt.values(found.named)[:len(model.param_names)]
-    for effect, value in ((effect, value) for formula in formulas for effect, value in zip(formula.effects, formula.values)):
-        wider = replace(model, catalogue=model.catalogue.with_effects(effect)).with_effect(effect.sensor, effect.name)
-        extended = wider.start_from(model, values)
-        extended[wider.slices[effect.key]] = value
-        model, values = wider, extended
+    for formula in formulas:
+        for effect, size in zip(formula.effects, formula.values):
+            known = replace(model, catalogue=model.catalogue.with_effects(effect))
+            model, values = known.with_sized_effect(values, effect.sensor, effect.name, size=size)
     left = residuals(found.used, table, model, values=values)
     edges = np.cumsum([len(window) for window in found.used])[:-1]
     tones = {}

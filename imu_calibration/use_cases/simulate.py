@@ -103,7 +103,8 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
     mover = given if motion.table is None else Table.from_mapping(motion.table)
     model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed, catalogue_of(catalogue))
     for name in effects:
-        model, values = _with_effect(model, values, name, *hidden_effect(model, name, seed, share=size, moment=0.6 * motion.duration))
+        sensor, hidden = hidden_effect(model, name, seed, share=size, moment=0.6 * motion.duration)
+        model, values = replace(model, point={}).with_sized_effect(values, sensor, name, size=hidden)
     warm = temperature or any('temperature' in effect.needs for effect in model.effects if effect.name in effects)
     noise = replace(GRADES[grade].noise, encoder_resolution=math.radians(encoder_resolution_deg), stamp_jitter=stamp_jitter_us * 1e-6)
     frame_id = table.imu_link if isinstance(table, Arm) and table.imu_link else LIKELY_LINK
@@ -174,11 +175,3 @@ def _require_joints(calibration, table):
     if calibration.model.reference and set(known) != set(names):
         raise InputError(f"the calibration must be of a table with joints {', '.join(names)}, it names {', '.join(known)}; give its table",
                          key='table')
-
-
-def _with_effect(model, values, name, sensor, hidden):
-    """Return (model, values) with one additional effect, whose values are `hidden`."""
-    wider = model.with_effect(sensor, name)
-    extended = wider.start_from(model, values)
-    extended[wider.slices[sensor, name]] = hidden
-    return replace(wider, point={}), extended
