@@ -12,7 +12,7 @@ from imu_calibration.compensation.compensate import compensate
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import judged_from_of, uncorrected_on_table
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import applied_values, not_applied, sensor_output, warped_reference
+from imu_calibration.effects.forward_equations import References, applied_values, not_applied, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
@@ -60,8 +60,7 @@ def applied_parameters(found: Investigation, chosen: Sequence[Question]) -> tupl
     model = replace(attempt.baseline, temperature_ref_c=wide.temperature_ref_c)
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
-    known = attempt.values(chosen)
-    values = np.concatenate([known[wide.slices[effect.key]] for effect in model.effects])
+    values = model.start_from(wide, attempt.values(chosen))
     model = model.at(values)
     centre = uncorrected_on_table(model, values, attempt.recording.accumulated(wide), gathered=wide).centre if not_applied(model) else {}
     return model, values, applied_values(model, values, centre)
@@ -71,13 +70,15 @@ def _errors(windows, table, model, values, applied):
     """Yield sensor -> error of the corrected readings of each window, m/s^2 and rad/s, shape (n, 3)."""
     motion, temperature, rows = all_samples(windows)
     ideal = with_reference(model, nominal_values(model), values)
-    refs = [warped_reference(model.at(ideal), sensor, table, motion=motion, temperature_c=temperature) for sensor in SENSORS]
+    at_ideal = model.at(ideal)
+    references = References(at_ideal, table, motion, temperature_c=temperature)
+    refs = [references.at(sensor) for sensor in SENSORS]
     ref = refs[1].select(rows)
     raw = [np.concatenate([measured(window, sensor) for window in windows]) for sensor in SENSORS]
     known = Calibration(model, applied, np.zeros((len(values),) * 2), (HELD,) * len(values))
     corrected = compensate(known, *raw, alpha_s=ref.alpha_s, temperature_c=ref.temperature_c, thermal_branch=ref.thermal_branch,
                            vibration=ref.vibration)
-    errors = [true - sensor_output(model.at(ideal), sensor, ideal, ref=own)[rows]
+    errors = [true - sensor_output(at_ideal, sensor, ideal, ref=own)[rows]
               for true, sensor, own in zip((corrected.force, corrected.rate), SENSORS, refs)]
     for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
         yield {sensor: error[start:stop] for sensor, error in zip(SENSORS, errors)}
