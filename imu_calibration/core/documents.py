@@ -150,7 +150,7 @@ def _look_through(events, what, aliases):
             continue
         if kind == 'AliasEvent' and not (aliases and event.anchor in sizes):
             raise DocumentError(f'a {what} must not use aliases, this document has YAML aliases (*{event.anchor}); write it without',
-                             code='yaml_alias')
+                                code='yaml_alias')
         if open_parts and open_parts[-1][2] is not None:
             _check_key(event, open_parts[-1], what)
         count += sizes[event.anchor] if kind == 'AliasEvent' else 1
@@ -174,14 +174,14 @@ def _check_key(event, mapping, what):
     key = getattr(event, 'value', None)
     if key in mapping[2] or (key == '<<' and event.implicit[0]):
         raise DocumentError(f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line '
-                         f'{event.start_mark.line + 1}; remove it', code='key_repeated')
+                            f'{event.start_mark.line + 1}; remove it', code='key_repeated')
     mapping[2].update([key] if key is not None else [])
 
 
 def _within_limits(number, limit, what, unit):
     if number > limit:
         raise DocumentError(f'a {what} must not have more than {limit} {unit}, this one has more; is it the right file?',
-                         code='document_limit')
+                            code='document_limit')
 
 
 def version_of(text: str) -> str:

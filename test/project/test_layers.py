@@ -185,10 +185,11 @@ def test_no_modules_import_each_other(tmp_path):
 
 def test_the_start_of_a_program_is_the_last_statement_of_its_module():
     """A function below it is missing while the program runs."""
-    starts = {path: [node.test for node in ast.parse(path.read_text()).body if isinstance(node, ast.If)] for path in modules('imu_calibration')}
-    guarded = {path: ast.parse(path.read_text()).body for path, tests in starts.items() if any('__main__' in ast.unparse(test) for test in tests)}
+    starts = {path: [isinstance(node, ast.If) and '__main__' in ast.unparse(node.test) for node in ast.parse(path.read_text()).body]
+              for path in modules('imu_calibration')}
+    guarded = {path: of_nodes for path, of_nodes in starts.items() if any(of_nodes)}
     assert len(guarded) >= 5
-    assert [path.name for path, body in guarded.items() if not (isinstance(body[-1], ast.If) and '__main__' in ast.unparse(body[-1].test))] == []
+    assert [path.name for path, of_nodes in guarded.items() if not of_nodes[-1]] == []
 
 
 def test_modules_of_all_layers_were_found():
