@@ -1,4 +1,4 @@
-"""compensator_node with a known arm predicts what another IMU of the same board feels: live, over real DDS."""
+"""Prediction of the readings of another IMU on the same board by compensator_node with a known arm: live, over real DDS."""
 
 import importlib.util
 import os
@@ -34,14 +34,14 @@ SPEED = 4.0
 MOVING = 2.0
 """rad/s; slower samples count as resting."""
 RATES = (2, 10, 20, 30, 60)
-"""rad/s; limits of the stretches that are shown apart."""
+"""rad/s; limits of the stretches with separate figures."""
 GUARD = 4
-"""Samples after a clipped one that the causal derivative still feels."""
+"""Samples after a clipped one that the causal derivative still contains."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Two IMUs of one board with everything the node and the comparison need."""
+    """Two IMUs of one board with the inputs of the node and of the comparison."""
 
     imu_a: object
     """The stretch of A, ImuSamples."""
@@ -62,7 +62,7 @@ class Case:
 
 
 def prepare(folder, name, arm_from, pair=PAIR, seconds=STRETCH_S):
-    """Return the Case of the last `seconds` of a recording; calibrations come from its poses, the arm from the recording `arm_from`."""
+    """Return the Case of the last `seconds` of a recording: calibrations from its poses, the arm from the recording `arm_from`."""
     topics = [f'/imu_{k}/data_raw' for k in pair]
     imus = [load(folder, name, topic) for topic in topics]
     found = []
@@ -91,7 +91,7 @@ def _after(bad):
 
 def play(case, speed=SPEED, domain_id=DOMAIN):
     """
-    Send A's messages to two compensator nodes, one turned into B's frame and one moved to B's place too; return what each publishes.
+    Send A's messages to two compensator nodes, one with the rotation to B's frame, one with the arm to B too; return the published messages of each.
 
     Returns
     -------
@@ -118,7 +118,7 @@ def play(case, speed=SPEED, domain_id=DOMAIN):
 
 
 def _exchange(rclpy, context, case, speed):
-    """Publish steadily, take what comes, and wait for the last one."""
+    """Publish at a constant rate, store the received messages, and wait for the last one."""
     from rclpy.executors import SingleThreadedExecutor
     from sensor_msgs.msg import Imu
 
@@ -159,7 +159,7 @@ def _spin_until(executor, condition, seconds, what=None):
 
 
 def residuals(case, came):
-    """Return {'turned', 'moved': B's force minus what the node published, for usable samples, shape (m, 3)}, and how many came."""
+    """Return {'turned', 'moved': B's force minus the published force, for usable samples, shape (m, 3)}, and the numbers of messages."""
     stamps = case.imu_a.stamp_ns.tolist()
     both = np.array([all(stamp in messages for messages in came.values()) for stamp in stamps])
     keep = case.usable & both
@@ -175,10 +175,10 @@ def rms(values):
 
 def looking_ahead(case):
     """
-    Return what two predictions leave that no live node can make, (m, 3) each, on the usable samples.
+    Return the residuals of two predictions with future samples, which a live node does not have, (m, 3) each, on the usable samples.
 
-    'central': the angular acceleration from the samples before and after. 'filter': from nine samples around, with the weights that
-    suit B's readings in this very stretch best; what even that leaves is not in the samples of the rate.
+    'central': the angular acceleration from the samples before and after. 'filter': from nine samples, with the weights that
+    fit B's readings in this stretch best; its residual is not determined by the samples of the rate.
     """
     calibration, (xyz, rpy), imu = calibration_from_text(case.calibration), case.pose_of_a, case.imu_a
     slope = np.gradient(imu.rate_s, 1e-9 * (imu.stamp_ns - imu.stamp_ns[0]), axis=0)

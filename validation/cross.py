@@ -1,4 +1,4 @@
-"""Recordings of hardware predict one another: halves, two parts of one trial, and what must be refused."""
+"""Tests of one recording of hardware against another: halves, two parts of one trial, and recordings that are refused."""
 
 from dataclasses import replace
 from functools import cache
@@ -24,7 +24,7 @@ WORSE = 1.05
 
 @cache
 def recording(folder, name):
-    """Return (Table, SampleBlock) of a whole recording."""
+    """Return (Table, SampleBlock) of a recording."""
     table, blocks = read(folder, name)
     parts = {field: [getattr(block, field) for block in blocks if getattr(block, field) is not None] for field in ('imu', 'joints')}
     return table, SampleBlock(*(type(part[0]).concatenate(part) for part in parts.values()))
@@ -55,7 +55,7 @@ def transfer(folder, made, used, parts=(None, None)):
 
 
 def outcome(found, checked):
-    """Return (what happened, whether it is as it must be): it helps and harms in no motion, or it is refused with a sentence."""
+    """Return (outcome as text, whether it is correct): each sensor helps without harm in a motion, or the recording is refused."""
     if checked is None:
         return f'refused: {found}', True
     words, claimed = [], []
@@ -68,9 +68,9 @@ def outcome(found, checked):
 
 def spread(first, second):
     """
-    Return the differences over combined standard deviations by group of parameters, of what both know.
+    Return the differences over combined standard deviations of the common parameters, by group.
 
-    Delays and filters of a sensor are one group: one cause, told by one explanation or another, whose size in all is a group of its own.
+    Delays and filters of a sensor are one group, because they are alternative descriptions of one cause; their sum is a separate group.
     """
     groups = {}
     theirs = dict(zip(second.param_names, zip(second.values, second.sd, second.status)))
@@ -104,7 +104,7 @@ def halves_together(folder):
 
 
 def must_be_refused(folder):
-    """Yield (what is wrong, what came out, whether it was noticed)."""
+    """Yield (fault, outcome as text, whether it was detected)."""
     table, block = recording(folder, 'shaft_yaw_medium')
     yield 'the IMU on the bench beside the shaft (wrong topic)', *_attempt(folder / 'shaft_yaw_medium', table, imu_topic='/imu_fixed/data_raw')
     yield 'stamps of the IMU one second late', *_attempt(replace(block, imu=replace(block.imu, stamp_ns=block.imu.stamp_ns + 10**9)), table)

@@ -17,7 +17,7 @@ LEAST_INFLATION, LEAST_SHAKEN = 0.8, 0.01
 LEAST_NOISE = {'accelerometer': 1e-6, 'gyroscope': 1e-7}
 """Least noise of a sample, m/s^2 and rad/s: readings of a noise-free simulator are exact except for stamps in integer ns."""
 VIBRATES = 4.0
-"""A table vibrates in a window whose variance exceeds the quiet level by this factor."""
+"""Variance of a window over the quiet level above which the table vibrates."""
 
 
 def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | None:
@@ -25,7 +25,7 @@ def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | 
     Return (white_variance, inflation) pooled over static windows, each shape (3,), or None without static windows.
 
     Windows whose variance differs from the median by more than a factor of two (clipped, knocked) are excluded. If vibration varies, the
-    reference is the quietest level instead of the median, because vibration hardly affects the means.
+    reference is the quietest level instead of the median, because vibration changes the means little.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | 
 
 
 def _usual(variances, inflations):
-    """Return (the median variance, False); where most windows vibrate far above the band of their means, (the second least, True)."""
+    """Return (the median variance, False); for vibration above the band of the means in most windows, (the second least, True)."""
     median = float(np.median(variances))
     quiet = float(np.partition(variances, 1)[1]) if len(variances) > 3 else median
     louder = variances > VIBRATES * quiet

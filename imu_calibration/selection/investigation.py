@@ -193,7 +193,7 @@ def _looked_again(outcome, attempted, any_size):
 
 
 def _settled(attempted, attempt, chosen):
-    """Return the _Outcome of a choice: relinearise at the effects, then keep those with sufficient share and gain."""
+    """Return the _Outcome of a choice: relinearise at the effects, then keep the ones with sufficient share and gain."""
     for _ in range(LINEARISATIONS - 1):
         if not attempt.needs_another(chosen):
             break
@@ -215,7 +215,7 @@ def _settled(attempted, attempt, chosen):
 
 
 def _searched(attempt, chosen):
-    """Return what a search chooses at another linearisation; it starts from the resolved effects."""
+    """Return the choice of a search at another linearisation; it starts from the resolved effects."""
     return attempt.search.run(_resolved(attempt, chosen))
 
 
