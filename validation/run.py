@@ -12,7 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
-    sys.path.insert(0, str(ROOT))
+    sys.path[:0] = [str(ROOT), str(ROOT / 'test')]   # simulated worlds are those of the tests
 
 from imu_calibration import __version__  # noqa: E402
 from imu_calibration.core.errors import ImuCalibrationError  # noqa: E402

@@ -80,7 +80,8 @@ def _faint(hand, found, asked):
 def extended_by_hand(data: HandData, found: 'HandInvestigation', options: HandOptions) -> HandCalibration:
     """Return the calibration with the requested model and the findings; denied or implausible effects increase its covariance."""
     asked, names = _asked(data, options), found.names
-    hand = solve_by_hand(data, replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS}), found.point())
+    extended = replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS})
+    hand = solve_by_hand(data, extended, found.point(found.inquiry, found.named))
     terms = hand.terms
     for question in (*found.denied, *found.implausible):
         moved = found.search.moved_by(found.named, question, found.baseline.param_names)

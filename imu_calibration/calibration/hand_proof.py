@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 
 from imu_calibration.calibration.proof import compared
-from imu_calibration.compensation.compensate import compensate
+from imu_calibration.compensation.compensate import Corrected, compensate
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import LAST_SHARE, Uncorrected, uncorrected_in_time
 from imu_calibration.effects.forward_equations import applied_values
@@ -15,6 +15,7 @@ from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, TurnData, between_middles
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
+from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.poses import distinct_attitudes
 
 FOLDS = 8
@@ -52,10 +53,10 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
     for out, without in held_out_values(hand, turns):
         values, part = applied_values(model.model, without, uncorrected.centre), _selected(poses, out & judged)
         left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last]) and judged[turn.first]]
-        norms.append([np.linalg.norm(_corrected(model, each, part.force, np.zeros_like(part.force), part.temperature_c).force, axis=1)
+        norms.append([np.linalg.norm(corrected_with(model, each, part.force, temperature_c=part.temperature_c).force, axis=1)
                       - hand.gravity for each in (plain, values)])
         if left and len(turns) - len(left) >= TURNS_LEAST:
-            angles.append([_missed(model, values, poses, left, gyroscope) for gyroscope in (plain, values)])
+            angles.append([turn_errors(model, values, poses, turns=left, gyroscope=gyroscope) for gyroscope in (plain, values)])
     if not norms:
         return {}
     proof = {'accelerometer': entry_of(_joined(norms), 'm/s^2')}
@@ -127,20 +128,22 @@ def _selected(poses, mask):
     return replace(poses, **{name: part[mask] for name, part in parts.items() if isinstance(part, np.ndarray)})
 
 
-def _corrected(model, values, force, rate, temperature_c):
-    """Return readings corrected as by compensation with some parameters."""
+def corrected_with(model: HandModel, values: np.ndarray, force: np.ndarray, *, rate: np.ndarray | None = None,
+                   temperature_c: np.ndarray | None = None) -> Corrected:
+    """Return readings corrected as by compensation with the parameters `values` of `model`; shape (n, 3); without `rate` at rest."""
+    rate = np.zeros_like(force) if rate is None else rate
     known = Calibration(model.model.at(values), values, np.zeros((model.size,) * 2), (HELD,) * model.size)
     return compensate(known, force, rate, alpha_s=np.zeros_like(force), temperature_c=temperature_c)
 
 
-def _missed(model, values, poses, turns, gyroscope):
+def turn_errors(model: HandModel, values: np.ndarray, poses: Poses, *, turns: Sequence[TurnData], gyroscope: np.ndarray) -> np.ndarray:
     """Return the angle errors of turns, rad, with the accelerometer of `values` and the parameters `gyroscope` of the gyroscope."""
     mixed = values.copy()
     for part in (model.gyro_bias, model.gyro_matrix, model.extra_index('gyroscope')):
         mixed[part] = gyroscope[part]
-    true = _corrected(model, values, poses.force, np.zeros_like(poses.force), poses.temperature_c).force
+    true = corrected_with(model, values, poses.force, temperature_c=poses.temperature_c).force
     up = true / np.linalg.norm(true, axis=1, keepdims=True)
-    rates = [_corrected(model, mixed, turn.force, turn.rate, turn.temperature_c).rate for turn in turns]
+    rates = [corrected_with(model, mixed, turn.force, rate=turn.rate, temperature_c=turn.temperature_c).rate for turn in turns]
     return np.array([turn_error(poses, turn, rate, up=up) for turn, rate in zip(turns, rates, strict=True)])
 
 

@@ -93,10 +93,10 @@ def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
     return max(found, key=lambda entry: (not np.isinf(entry[0].least), entry[1]))[0]
 
 
-def gain_of(sensor: str, measure: str, pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> Gain:
+def gain_of(sensor: str, measure: str, pair: Sequence[tuple[np.ndarray, np.ndarray]], *, of: str = OF_MODEL) -> Gain:
     """Return the Gain from (sums of squares, numbers) of each group of rows, before and after."""
     before, after = (_rms(*entry) for entry in pair)
-    return Gain(sensor, measure, before, after, reduction_interval(pair), len(pair[0][0]))
+    return Gain(sensor, measure, before, after, reduction_interval(pair), len(pair[0][0]), of)
 
 
 def _squares(space, values, sensor):

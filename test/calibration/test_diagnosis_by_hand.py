@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from refusal import refused
 
 from imu_calibration.calibration.diagnosis import hand_diagnosis
@@ -21,6 +22,7 @@ from imu_calibration.references.gravity.hand_calibration import gather_by_hand, 
 from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.model_selection import Inquiry, investigate_by_hand
 from imu_calibration.selection import regimes
+from imu_calibration.selection.gain import APPLIED, OF_MODEL
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import random_values
 from imu_calibration.simulation.session import simulate as simulate_session
@@ -51,7 +53,7 @@ def diagnose_by_hand(data, options):
     """The findings and the extended calibration."""
     found = investigate_by_hand(data, options)
     hand = extended_by_hand(data, found, options)
-    return SimpleNamespace(diagnosis=told_by_hand(found, hand), hand=hand)
+    return SimpleNamespace(diagnosis=told_by_hand(found, hand), hand=hand, search=found)
 
 
 def diagnosed(seed, spoil=None, n_poses=24, **options):
@@ -73,6 +75,7 @@ def test_a_hidden_effect_is_found_and_its_gain_measured(name, responding):
     first = found.findings[0]
     assert name in (first.effect, *first.indistinguishable_from)
     assert first.gain.ci95[0] > 0 and first.gain.windows >= 23
+    assert first.gain.of == (OF_MODEL if name.endswith('drift') else APPLIED)   # a drift is replaced by its value at the end
     assert len(found.findings) == 1
 
 
@@ -120,6 +123,21 @@ def test_a_place_among_few_poses_is_paid_for(monkeypatch):
         block = SimpleNamespace(sensor='gyroscope', floor=np.ones((24, 3)), pose=np.arange(24), time=poses.time)
         told += hand_diagnosis.regimes_by_hand(hand, block, rng.normal(size=(24, 3)))
     assert len(told) <= 2
+
+
+def test_the_gain_is_the_error_of_corrected_readings_in_held_out_poses(responding):
+    """At rest: rates inverted by the model of the estimate, less that of the Earth about the vertical; each side from the other poses."""
+    found, gain = responding.search, responding.diagnosis.findings[0].gain
+    poses, squares = found.baseline.poses, [0.0, 0.0]
+    for out, named, smaller in found.held_out:
+        for side, chosen in enumerate(([], [q for q in named if q.name == 'gyro_g_sensitivity'])):
+            model, values, earth = found.extended(smaller, chosen)
+            force, rate = model.compensate(values, poses.force[out], poses.rate[out])
+            squares[side] += np.sum((rate - earth * force / np.linalg.norm(force, axis=1)[:, None])**2)
+    assert (gain.of, gain.measure, gain.windows) == (APPLIED, 'poses', len(poses.start))
+    assert_allclose([gain.heldout_rms_before, gain.heldout_rms_after], np.sqrt(np.array(squares) / poses.rate.size), rtol=1e-7)
+    of_model = found.gain([], found.named, 'gyroscope')
+    assert of_model.of == OF_MODEL and abs(gain.heldout_rms_before / of_model.heldout_rms_before - 1) > 1e-3
 
 
 def test_sizes_agree_with_what_was_hidden(responding):

@@ -7,16 +7,18 @@ from itertools import pairwise
 import numpy as np
 
 from imu_calibration.calibration.diagnosis.traces import DistanceSums
+from imu_calibration.calibration.hand_proof import corrected_with, end_by_hand, turn_errors
 from imu_calibration.calibration.proof import nominal_values, with_reference
 from imu_calibration.compensation.compensate import compensate
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.trust import judged_from_of, uncorrected_on_table
+from imu_calibration.document.trust import judged_from_of, uncorrected_in_time, uncorrected_on_table
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import References, applied_values, not_applied, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import all_samples, chunks
+from imu_calibration.references.gravity.model_selection import HandInvestigation, gain_of_poses
 from imu_calibration.selection.gain import APPLIED, Gain, gain_in_turn, heldout_gain
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.questions import Question
@@ -64,6 +66,43 @@ def applied_parameters(found: Investigation, chosen: Sequence[Question]) -> tupl
     model = model.at(values)
     centre = uncorrected_on_table(model, values, attempt.recording.accumulated(wide), gathered=wide).centre if not_applied(model) else {}
     return model, values, applied_values(model, values, centre)
+
+
+def gain_by_hand(found: HandInvestigation, before: Sequence[Question], *, after: Sequence[Question], sensor: str) -> Gain:
+    """
+    Return the Gain of the findings `after` over the findings `before` on the held-out poses and turns.
+
+    The errors are those of `hand_proof.prove_by_hand` and, at rest, the corrected rate less that of the Earth about the vertical. Choice
+    and estimate of each side exclude the poses; if no additional finding can be compensated, the residual is that of the model.
+    """
+    applied = [[question for question in some if question in found.adopted] for some in (before, after)]
+    if not any(question.effect.compensation == 'exact' for question in applied[1] if question not in applied[0]):
+        return found.gain(before, after, sensor)
+    block, poses = found.clearest(applied[0], applied[1], sensor), found.baseline.poses
+    pair = [np.zeros((len(block.pose), 1 if block.duration is not None else block.known.shape[1])) for _ in applied]
+    start = 0.0
+    for out, named, smaller in found.held_out:
+        rows = np.isin(block.pose, out)
+        for errors, chosen in zip(pair, applied):
+            names = {question.name for question in chosen}
+            model, values, earth = found.extended(smaller, [question for question in named if question.name in names])
+            moved = model.model.at(values)
+            start = max(start, judged_from_of(moved, end_by_hand(poses)))
+            values = applied_values(moved, values, uncorrected_in_time(moved, values, poses.time, end=end_by_hand(poses)).centre)
+            errors[rows] = _pose_errors(found, block, np.flatnonzero(rows), model, values, earth)
+    return gain_of_poses(block.select(late := block.time >= start), [errors[late] for errors in pair], APPLIED)
+
+
+def _pose_errors(found, block, rows, model, values, earth):
+    """Return the errors of some rows of a block after correction: of poses m/s^2 or rad/s, of turns the angle over the duration, rad/s."""
+    poses = found.baseline.poses
+    if block.duration is not None:
+        missed = turn_errors(model, values, poses, turns=[found.turns[row] for row in rows], gyroscope=values)
+        return (missed / block.duration[rows])[:, None]
+    warm = None if poses.temperature_c is None else poses.temperature_c[rows]
+    corrected = corrected_with(model, values, poses.force[rows], rate=poses.rate[rows], temperature_c=warm)
+    norm = np.linalg.norm(corrected.force, axis=1, keepdims=True)
+    return norm - found.baseline.gravity if block.sensor == 'accelerometer' else corrected.rate - earth * corrected.force / norm
 
 
 def _errors(windows, table, model, values, applied):

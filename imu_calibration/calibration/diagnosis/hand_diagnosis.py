@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.calibration.diagnosis.applied_gain import gain_by_hand
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
 from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of
 from imu_calibration.calibration.diagnosis.traces import Traces
@@ -147,11 +148,11 @@ def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
     before, after = as_solution(found.baseline), as_solution(hand)
 
     def gain_of(place):
-        return found.gain(named[:place], named[:place + 1], named[place].sensor)
+        return gain_by_hand(found, named[:place], after=named[:place + 1], sensor=named[place].sensor)
 
     findings = tuple(finding(inquiry.search, named, place, solution=after, share=inquiry.explained.share, gain_of=gain_of,
                              motion_of=motions_of) for place in range(len(named)))
-    gain = found.gain([], named, named[0].sensor) if named else None
+    gain = gain_by_hand(found, [], after=named, sensor=named[0].sensor) if named else None
     count = len(found.baseline.poses.start)
     return Diagnosis(findings, {s: rest_of(found.baseline, inquiry, named, sensor=s) for s in SENSORS},
                      candidates_of(inquiry.search, named),

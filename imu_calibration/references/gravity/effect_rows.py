@@ -88,10 +88,14 @@ def build_rows(hand: HandCalibration, turns: Sequence[TurnData], effects: Sequen
     sensor_of = {label: effect.sensor for effect, label, _ in sets}
     moving = [effect for effect, label, tau in sets if effect.sensor == 'gyroscope' and tau is None]
     blocks = [_norm_block(hand, space, at_rest, sensor_of), _rest_block(hand, space, at_rest, sensor_of)]
-    gravity_turns = [turn for turn in turns if turn.rotation is None]
-    if gravity_turns:
-        blocks.append(_turn_block(hand, gravity_turns, space, at_rest, moving))
+    if between := gravity_turns(turns):
+        blocks.append(_turn_block(hand, between, space, at_rest, moving))
     return blocks, space
+
+
+def gravity_turns(turns: Sequence[TurnData]) -> list[TurnData]:
+    """Return the turns between poses, with gravity as reference, without those of known angle."""
+    return [turn for turn in turns if turn.rotation is None]
 
 
 def _columns(hand, effect, tau, force, rate, time, temperature_c):

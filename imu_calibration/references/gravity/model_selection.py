@@ -9,15 +9,16 @@ from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.progress import reported
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE
-from imu_calibration.references.gravity.effect_rows import Block, HandSpace, build_rows
+from imu_calibration.references.gravity.effect_rows import Block, HandSpace, build_rows, gravity_turns
+from imu_calibration.references.gravity.equations import TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, HandData, solve_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions
-from imu_calibration.references.gravity.hand_parameters import possible_by_hand
+from imu_calibration.references.gravity.hand_parameters import HandModel, possible_by_hand
 from imu_calibration.references.gravity.pose_evidence import HandEvidence
 from imu_calibration.selection.evidence import agree
 from imu_calibration.selection.explained_share import Explained, pruned
-from imu_calibration.selection.gain import Gain, gain_of
+from imu_calibration.selection.gain import OF_MODEL, Gain, gain_of
 from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
 from imu_calibration.selection.search import Named, Search
 
@@ -46,6 +47,12 @@ class Inquiry:
     def _blocks_without(self, poses):
         blocks = [block.select(~np.isin(block.pose, poses)) for block in self.blocks]
         return [block for block in blocks if block.known.size > 3]
+
+    def values(self, chosen: Sequence[Question]) -> np.ndarray:
+        """Return the parameters of `HandSpace` with some effects, zero for all others, shape (q,)."""
+        used, values = list(self.search.used(chosen)), np.zeros(self.space.size)
+        values[used] = self.evidence.fit(used)[0]
+        return values
 
     def named(self) -> list[Question]:
         """
@@ -95,6 +102,8 @@ class HandInvestigation(Named):
     """Effects that could not be tested."""
     constants: np.ndarray
     """Time constants of the warm-ups under test, s."""
+    turns: Sequence[TurnData]
+    """Turns of the rows."""
     denied: Sequence[Question] = field(default_factory=list)
     """Effects that were rejected because the estimates of the two halves differ significantly."""
 
@@ -108,19 +117,34 @@ class HandInvestigation(Named):
         """Search of the findings."""
         return self.inquiry.search
 
-    def point(self) -> dict[str, np.ndarray]:
-        """Return effect -> initial values for its columns, of the warm-ups among the findings."""
-        used = self.inquiry.search.used(self.named)
-        values, point = self.inquiry.evidence.fit(used)[0], {}
-        for question in self.named:
-            if '@' in question.label:
-                amplitude = [values[used.index(k)] for k in question.parameters]
-                point[question.name] = np.array([*amplitude, self.constants[int(question.label.split('@')[1])]])
-        return point
+    def point(self, inquiry: Inquiry, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
+        """Return effect -> initial values for its columns, of the warm-ups among the chosen effects, from the rows of `inquiry`."""
+        fit, warm = inquiry.values(chosen), [question for question in chosen if '@' in question.label]
+        return {q.name: np.append(fit[list(q.parameters)], self.constants[int(q.label.split('@')[1])]) for q in warm}
 
     def gain(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Gain:
         """Return the Gain of one choice over another on poses held out from both fit and choice."""
         return _gain(self.inquiry, self.held_out, before, after, sensor)
+
+    def clearest(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Block:
+        """Return the rows of a sensor in which one choice improves most over another by cross-validation of the fit."""
+        return self.inquiry.blocks[_clearest(self.inquiry, before, after, sensor)]
+
+    def extended(self, inquiry: Inquiry, chosen: Sequence[Question]) -> tuple[HandModel, np.ndarray, float]:
+        """
+        Return the baseline extended by some effects: (model, parameters, the Earth's rate about the vertical, rad/s).
+
+        `inquiry` has the rows for the estimate, those of this investigation or fewer.
+        """
+        hand, point, fit = self.baseline, self.point(inquiry, chosen), inquiry.values(chosen)
+        base = hand.model.model
+        names = {sensor: getattr(base, sensor) + tuple(q.name for q in chosen if q.sensor == sensor) for sensor in SENSORS}
+        model = replace(hand.model, model=replace(base, **names, point={**base.point, **point}))
+        values = model.model.start_from(base, hand.state.values + fit[:hand.model.size])
+        for question in chosen:
+            if question.name not in point:
+                values[model.model.slices[question.effect.key]] = fit[list(question.parameters)]
+        return model, values, fit[hand.model.size]
 
 
 def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) -> HandInvestigation:
@@ -161,7 +185,7 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
     denied = [question for question in named if not inquiry.agrees_in_halves(named, question)]
     if denied:
         named = _that_predict(inquiry, held_out, [question for question in named if question not in denied])
-    return HandInvestigation(baseline, inquiry, named, held_out, not_testable, constants, denied)
+    return HandInvestigation(baseline, inquiry, named, held_out, not_testable, constants, gravity_turns(data.turns), denied)
 
 
 def too_few_poses(count: int) -> NotObservableError:
@@ -200,7 +224,7 @@ def _why_not(effect, poses, turns, follows_gravity):
     if effect.role is Role.CROSS and not follows_gravity:   # the same test as in calibration
         return ('rates at rest do not separate it from a bias that moves in time', 'hold each attitude again later, in a different order')
     moving = effect.sensor == 'gyroscope' and any('rate' in group.uses for group in effect.groups)
-    if moving and len([t for t in turns if t.rotation is None]) < 6:
+    if moving and len(gravity_turns(turns)) < 6:
         return 'there are fewer than six turns between poses', 'turn it by half a turn between poses'
     return None
 
@@ -238,21 +262,31 @@ def _predicted(inquiry, held_out, allowed):
     found = [np.full(block.known.shape, np.nan) for block in inquiry.blocks]
     for out, named, smaller in held_out:
         chosen = [q for q in named if q.name in allowed]
-        used = smaller.search.used(chosen)
-        values = smaller.evidence.fit(used)[0]
+        values = smaller.values(chosen)
         for residual, block in zip(found, inquiry.blocks):
             rows = np.isin(block.pose, out)
-            residual[rows] = block.rows[rows, :, -1] - block.rows[rows][:, :, list(used)] @ values
+            residual[rows] = block.rows[rows, :, -1] - block.rows[rows, :, :-1] @ values
     return found
 
 
 def _gain(inquiry, held_out, before, after, sensor):
     """Return the Gain of one choice over another on poses held out from both fit and choice."""
-    pair = [_predicted(inquiry, held_out, {q.name for q in choice}) for choice in (before, after)]
+    best = _clearest(inquiry, before, after, sensor)
+    block = inquiry.blocks[best]
+    pair = [_predicted(inquiry, held_out, {q.name for q in choice})[best] for choice in (before, after)]
+    return gain_of_poses(block, pair)
+
+
+def _clearest(inquiry, before, after, sensor):
+    """Return the place of the sensor's block with the largest reduction by cross-validation of the fit."""
     inside = [inquiry.evidence.heldout_residuals(inquiry.search.used(choice)) for choice in (before, after)]
     own = [k for k, block in enumerate(inquiry.blocks) if block.sensor == sensor]
-    best = min(own, key=lambda k: np.sum(inside[1][k]**2) / max(np.sum(inside[0][k]**2), 1e-300))
-    block = inquiry.blocks[best]
+    return min(own, key=lambda k: np.sum(inside[1][k]**2) / max(np.sum(inside[0][k]**2), 1e-300))
+
+
+def gain_of_poses(block: Block, pair: Sequence[np.ndarray], of: str = OF_MODEL) -> Gain:
+    """Return the Gain from residuals of each row of a block before and after, shape (m, n), resampled by pose."""
     place = np.unique(block.pose, return_inverse=True)[1]
     numbers = np.bincount(place) * block.known.shape[1]
-    return gain_of(sensor, block.name, [(np.bincount(place, (residuals[best]**2).sum(axis=1)), numbers) for residuals in pair])
+    return gain_of(block.sensor, block.name, [(np.bincount(place, (residuals**2).sum(axis=1)), numbers) for residuals in pair],
+                   of=of)
