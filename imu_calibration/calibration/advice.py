@@ -133,7 +133,7 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     Recommended is the next step of the common plan, shown in the picture, if it serves the sensor; otherwise the best step for the sensor.
     """
     knowledge, lacking = knowledge_after(hand), {}
-    for name, status, sd, tolerance in zip(hand.param_names, hand.statuses, hand.own_sd, hand.tolerances, strict=True):
+    for name, status, sd, tolerance in zip(hand.param_names, hand.statuses, hand.judged_sd, hand.tolerances, strict=True):
         if status in LACKING:
             lacking.setdefault(name.split('.')[0], {})[name] = float(sd / tolerance)
     parts = {sensor: [hand.param_names.index(name) for name in lacking[sensor]] for sensor in SENSORS if sensor in lacking}
@@ -180,14 +180,14 @@ def knowledge_at_first(model: HandModel, tolerances: np.ndarray, *,
 
 def knowledge_after(hand: HandCalibration) -> HandKnowledge:
     """Return the HandKnowledge of a solution: its information, reduced by the growth of its standard deviations beyond noise."""
-    model, statistics, poses = hand.model, hand.statistics, hand.poses
+    model, statistics, poses = hand.hand_model, hand.statistics, hand.poses
     expected = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
     known = expected < 0.5 * model.priors
-    wider = max(1.0, float(np.max(np.where(known, hand.own_sd / expected, 0.0))))
+    wider = max(1.0, float(np.max(np.where(known, hand.judged_sd / expected, 0.0))))
     pose_sd = np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd'])
     drift_sd = np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd'])
     turn_sd = max(statistics['turn_scatter_sd'], 1e-4)
-    return HandKnowledge(model, hand.state.values, hand.information / wider**2, MARGIN * hand.tolerances,
+    return HandKnowledge(model, hand.values, hand.information / wider**2, MARGIN * hand.tolerances,
                          float(wider * pose_sd), float(wider * drift_sd), float(wider * turn_sd), ups_of(poses)[-1])
 
 

@@ -1,6 +1,6 @@
 """The document from a solution, and changes of the model that it reports."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from typing import Any
@@ -14,8 +14,9 @@ from imu_calibration.document.trust import Uncorrected
 from imu_calibration.document.verdict import judged
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import centred
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import observability
-from imu_calibration.estimation.covariance_terms import GRAVITY, REJECTED, replace_weak, with_term
+from imu_calibration.estimation.covariance_terms import GRAVITY, REJECTED, with_term
 from imu_calibration.estimation.observability import Motion, motions_about
 from imu_calibration.estimation.solution import Solution, reasons_held, statuses
 from imu_calibration.estimation.weighted_system import make_prior
@@ -120,30 +121,57 @@ def possible_motions(table: Table) -> tuple[Motion, ...] | None:
     return motions_about(*(table.mat_sl @ np.asarray(direction) for direction in (table.joints[0].axis, table.up)))
 
 
-def document(solution: Solution, tolerances: np.ndarray, table: Table, *, gathered: Gathered, needed: dict[str, tuple[str, float]],
-             provenance: dict | None = None, proof: dict | None = None, changes: ModelChanges = ModelChanges(),
-             uncorrected: Uncorrected = Uncorrected()) -> Calibration:
-    """Return the Calibration for a solution, with statuses, weak directions, the motions that would help, its `proof` and the verdict."""
-    model = solution.model
-    covariance, sd = solution.covariance, solution.sd
-    status = statuses(sd, solution.held, tolerances)
-    directions = observability.weak_directions(covariance, tolerances, model.param_names)
-    others = _besides(directions, needed, dict(zip(model.param_names, sd / tolerances)))
-    undetermined = tuple({'parameters': weights, 'needs': need}
-                         for weights, need in (*((each, _need(each, needed)) for each in directions), *others))
+def document(solution: Solution, tolerances: np.ndarray, gathered: Gathered, *, gravity: float, gauge: dict, undetermined: tuple[dict, ...],
+             statistics: dict, provenance: dict | None, proof: dict | None, changes: ModelChanges, uncorrected: Uncorrected,
+             tested: Collection[str] = ()) -> Calibration:
+    """
+    Return the Calibration for a solution, with statuses and the verdict.
+
+    Parameters
+    ----------
+    solution : Solution
+    tolerances : ndarray, shape (n_params,)
+    gathered : Gathered
+        Data of the recording.
+    gravity : float
+        Of the reference, m/s^2.
+    gauge, undetermined, statistics, provenance, proof
+        Parts of the document.
+    changes : ModelChanges
+    uncorrected : Uncorrected
+        Effects in time that compensation does not correct; their centres are included in the values.
+    tested : names, optional
+        Parameters that are replaced by a likelihood-ratio test.
+
+    """
+    final = solution.model.at(solution.values)
+    values, slope = centred(final, solution.values, uncorrected.centre)
+    terms = {name: slope @ term @ slope.T for name, term in solution.terms.items()}
+    moved = replace(solution, values=values, terms=terms)
+    found = {**statistics, **preflight_statistics(gathered.findings), **changes.to_mapping(), **uncorrected.to_mapping()}
+    calibration = Calibration(replace(final, centre=dict(uncorrected.centre)), values, moved.covariance,
+                              statuses(moved.judged_sd, moved.held, tolerances), gathered.frame_id, gauge, undetermined, found,
+                              conditions(gathered, gravity), {'software': imu_calibration.__version__, **(provenance or {})},
+                              proof=proof or {}, covariance_terms={name: np.diag(term) for name, term in terms.items()},
+                              held_reason=reasons_held(solution.held, solution.param_names, solution.replaced, tested=tested))
+    return judged(calibration, tolerances)
+
+
+def weak_on_table(solution: Solution, tolerances: np.ndarray, needed: dict[str, tuple[str, float]]) -> tuple[dict, ...]:
+    """Return the weak directions with the motions that would help, and the parameters that none of them names."""
+    directions = observability.weak_directions(solution.covariance, tolerances, solution.param_names)
+    others = _besides(directions, needed, dict(zip(solution.param_names, solution.sd / tolerances)))
+    return tuple({'parameters': weights, 'needs': need}
+                 for weights, need in (*((each, _need(each, needed)) for each in directions), *others))
+
+
+def gauge_of(model: SensorModel) -> dict[str, Any]:
+    """Return the conventions of origin and axes on a table."""
     both_arms = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
     gauge: dict[str, Any] = {'origin': 'mean_of_sensitive_points' if both_arms else 'mount', 'axes': 'mount'}
     if model.joint_names.angle_sd is not None:
         gauge['zeros_as_described'] = list(model.joint_names.taken_as_described)
-    final = model.at(solution.values)
-    values, slope = centred(final, solution.values, uncorrected.centre)
-    found = statistics(solution, gathered) | changes.to_mapping() | uncorrected.to_mapping()
-    calibration = Calibration(replace(final, centre=dict(uncorrected.centre)), values, slope @ covariance @ slope.T, status,
-                              gathered.frame_id, gauge, undetermined, found, conditions(gathered, table.gravity_value),
-                              {'software': imu_calibration.__version__, **(provenance or {})}, proof=proof or {},
-                              covariance_terms={name: np.diag(slope @ term @ slope.T) for name, term in solution.terms.items()},
-                              held_reason=reasons_held(solution.held, model.param_names, solution.replaced))
-    return judged(calibration, tolerances)
+    return gauge
 
 
 def _need(weights, needed):
@@ -168,20 +196,6 @@ def with_gravity_uncertainty(solution: Solution, table: Table) -> Solution:
     return replace(solution, terms=with_term(solution.terms, GRAVITY, np.outer(direction, direction)))
 
 
-def with_weak_replaced(solution: Solution, tolerances: np.ndarray) -> Solution:
-    """
-    Return the solution with weak values that compensation applies replaced by their prior where that lowers the expected error.
-
-    See `replace_weak`. A replaced parameter is held.
-    """
-    model, applied = solution.model, np.repeat([e.compensation == 'exact' for e in solution.model.effects],
-                                               [e.size for e in solution.model.effects])
-    weak = np.flatnonzero(applied & ~solution.held & (solution.sd > tolerances))
-    values, terms, replaced = replace_weak(solution.values, solution.terms, make_prior(model).mean, weak=weak.tolist())
-    return replace(solution, values=values, terms=terms, held=solution.held | replaced,
-                   replaced=tuple(np.array(model.param_names)[replaced].tolist()))
-
-
 def statistics(solution: Solution, gathered: Gathered) -> dict:
     """Return the statistics section: noise, residuals, chi-square, windows, dropped samples."""
     result = {}
@@ -203,7 +217,7 @@ def statistics(solution: Solution, gathered: Gathered) -> dict:
     result['samples_used'] = dict(sorted(accumulator.samples.items()))
     result['dropped'] = dropped(gathered.counts)
     result['stream'] = {key: value for key, value in sorted(gathered.counts.items()) if key not in result['dropped']}
-    return result | preflight_statistics(gathered.findings)
+    return result
 
 
 def preflight_statistics(findings: Sequence[CheckFinding]) -> dict:

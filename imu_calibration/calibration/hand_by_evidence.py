@@ -60,7 +60,7 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
 
 def _solved(data, found, options):
     """Return the calibration with the requested model and the findings; if the model is unchanged, the one of the search."""
-    asked, names, base = _asked(data, options), found.names, found.baseline.model.model
+    asked, names, base = _asked(data, options), found.names, found.baseline.model
     same = all(getattr(base, sensor) == _joined(asked[sensor], names[sensor]) for sensor in SENSORS)
     return found.baseline if same and not (found.denied or found.implausible) else extended_by_hand(data, found, options)
 
@@ -69,7 +69,7 @@ def _faint(hand, found, asked):
     """Return the effects that were added and are implausible or have no significant coefficient."""
     faint = []
     for question in found.adopted:
-        effect, part = question.effect, hand.model.model.slices[question.effect.key]
+        effect, part = question.effect, hand.model.slices[question.effect.key]
         at = np.arange(part.start, part.start + effect.n_amplitudes)
         values, sd = hand.values[at], hand.sd[at]
         if question.name not in asked[question.sensor] and (effect.surpasses(values) or not one_significant(values, sd)):

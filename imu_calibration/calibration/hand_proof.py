@@ -46,7 +46,7 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
         Turns of the estimate.
 
     """
-    poses, model, uncorrected = hand.poses, hand.model, uncorrected_by_hand(hand)
+    poses, model, uncorrected = hand.poses, hand.hand_model, uncorrected_by_hand(hand)
     plain = replace(model, gyro_factor=1.0).nominal
     judged = poses.time >= (LAST_SHARE * end_by_hand(poses) if uncorrected.sizes else 0.0)
     norms, angles = [], []
@@ -73,10 +73,10 @@ def held_out_values(hand: HandCalibration, turns: Sequence[TurnData]) -> list[tu
 
 def values_without(hand: HandCalibration, turns: Sequence[TurnData], folds: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the parameters without the poses of each mask and the turns that begin or end there: one Gauss-Newton step."""
-    model = hand.model
-    system = GravityRows(model, hand.used_poses, turns).linearise(hand.state)
+    model = hand.hand_model
+    system = GravityRows(model, hand.used_poses, turns).linearise(replace(hand.state, values=hand.values))
     scatter = np.array([*(hand.statistics[f'{name}_scatter_sd']**2 for name in COMPONENTS), 0.0])
-    free = ~(np.array(hand.statuses) == HELD) & ~model.fixed
+    free = ~hand.held & ~model.fixed
     rows = np.column_stack([system.nuisance, system.main[:, free], system.residual])
     rows /= np.sqrt(system.noise + scatter[system.component])[:, None]
     prior = np.column_stack([np.diag(1.0 / model.priors), (model.nominal - hand.values) / model.priors])[free][:, np.append(free, True)]
@@ -106,8 +106,7 @@ def end_by_hand(poses: Poses) -> float:
 
 def uncorrected_by_hand(hand: HandCalibration) -> Uncorrected:
     """Return the effects in time that compensation replaces by their value at the end of the recording."""
-    values = hand.state.values
-    return uncorrected_in_time(hand.model.model.at(values), values, hand.poses.time, end=end_by_hand(hand.poses))
+    return uncorrected_in_time(hand.model.at(hand.values), hand.values, hand.poses.time, end=end_by_hand(hand.poses))
 
 
 def _joined(folds):

@@ -1,14 +1,13 @@
 """A calibration by hand with the same document and result as a calibration on a table."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-import imu_calibration
 from imu_calibration.calibration.advice import missing_motion
-from imu_calibration.calibration.from_solution import conditions, preflight_statistics
+from imu_calibration.calibration.from_solution import document
 from imu_calibration.calibration.hand_by_evidence import EvidentHand, solve_by_evidence
 from imu_calibration.calibration.hand_proof import (
     PER_TURN,
@@ -26,11 +25,8 @@ from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, NominalScaling, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.verdict import judged
 from imu_calibration.effects.base import SENSORS, UNIT, Role
-from imu_calibration.effects.forward_equations import centred
-from imu_calibration.estimation.covariance_terms import GRAVITY
-from imu_calibration.estimation.solution import HELD, reasons_held, statuses
+from imu_calibration.estimation.solution import with_weak_replaced
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
@@ -38,7 +34,7 @@ from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, Watcher
 from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.equations import TurnData
-from imu_calibration.references.gravity.hand_calibration import HandCalibration, HandData, gather_by_hand, with_weak_replaced
+from imu_calibration.references.gravity.hand_calibration import GAUGE, HandCalibration, HandData, gather_by_hand
 from imu_calibration.references.gravity.hand_options import hand_options
 from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS
 from imu_calibration.references.options import CalibrationOptions
@@ -81,7 +77,7 @@ class HandResult(CalibrationResult):
         true, zero = hand.gravity * hand.state.up, np.zeros_like(rate)
         corrected_force, corrected_rate = hand.compensate(force, rate, poses.time, temperature_c=poses.temperature_c)
         for out, values in held_out_values(hand, hand.used_turns):
-            corrected = hand.model.compensate(values, force, rate, time=poses.time, temperature_c=poses.temperature_c)
+            corrected = hand.hand_model.compensate(values, force, rate, time=poses.time, temperature_c=poses.temperature_c)
             corrected_force[out], corrected_rate[out] = (part[out] for part in corrected)
         samples = max(int(poses.stop[-1]), 1)
         time = (poses.start + poses.stop) / 2 * self.gathered.duration / max(samples - 1, 1)
@@ -209,25 +205,17 @@ def hand_result(evident: EvidentHand, recording: HandRecording, options: Calibra
         When the specific force at rest is clearly in another unit.
 
     """
-    hand = with_weak_replaced(evident.hand)
+    hand = with_weak_replaced(evident.hand, evident.hand.tolerances)
     check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
-    model, gathered = hand.model.model, recording.gathered
-    gathered.findings = findings = (*findings, *notes(hand.statistics['bias_moved'], gathered.duration))
-    uncorrected = uncorrected_by_hand(hand)
-    values, slope = centred(final := model.at(hand.values), hand.values, uncorrected.centre)
-    terms = {name: np.diag(slope @ term @ slope.T) for name, term in hand.terms.items()}
-    covariance, held, tolerances = slope @ hand.covariance @ slope.T, np.array(hand.statuses) == HELD, hand.tolerances
-    statistics = _statistics(hand, gathered.counts, len(recording.imu)) | preflight_statistics(findings) | evident.changes.to_mapping()
-    statistics |= uncorrected.to_mapping()
-    status = statuses(np.sqrt(sum(term for name, term in terms.items() if name != GRAVITY)), held, tolerances)
+    gathered = recording.gathered
+    gathered.findings = (*findings, *notes(hand.statistics['bias_moved'], gathered.duration))
     advice = missing_motion(hand)
-    calibration = Calibration(replace(final, centre=dict(uncorrected.centre)), values, covariance, status,
-                              gathered.frame_id, dict(hand.gauge), advice, statistics,
-                              conditions(gathered, hand.gravity), {'software': imu_calibration.__version__, **(provenance or {})},
-                              proof=prove_by_hand(hand, hand.used_turns if turns else ()),
-                              covariance_terms=terms, held_reason=reasons_held(held, model.param_names, hand.replaced, tested=CROSS_TERMS))
+    calibration = document(hand, hand.tolerances, gathered, gravity=hand.gravity, gauge=dict(GAUGE), undetermined=advice,
+                           statistics=_statistics(hand, gathered.counts, len(recording.imu)), provenance=provenance,
+                           proof=prove_by_hand(hand, hand.used_turns if turns else ()), changes=evident.changes,
+                           uncorrected=uncorrected_by_hand(hand), tested=CROSS_TERMS)
     needed = {name: (item['needs'], float('nan')) for item in reversed(advice) for name in item['parameters']}
-    return HandResult(calibration=judged(calibration, tolerances), gathered=gathered, tolerances=tolerances, needed=needed,
+    return HandResult(calibration=calibration, gathered=gathered, tolerances=hand.tolerances, needed=needed,
                       options=options, hand=hand)
 
 

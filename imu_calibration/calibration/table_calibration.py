@@ -9,7 +9,15 @@ import numpy as np
 
 from imu_calibration.calibration import collector
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.from_solution import ModelChanges, document, motions_needed, with_gravity_uncertainty, with_weak_replaced
+from imu_calibration.calibration.from_solution import (
+    ModelChanges,
+    document,
+    gauge_of,
+    motions_needed,
+    statistics,
+    weak_on_table,
+    with_gravity_uncertainty,
+)
 from imu_calibration.calibration.proof import prove_readings, prove_solution, reference_model, reference_values
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.compensation.compensate import invertible
@@ -23,7 +31,7 @@ from imu_calibration.document.trust import end_of, judged_from_of, uncorrected_o
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import restrict
-from imu_calibration.estimation.solution import Solution, shrunk, tolerances_of
+from imu_calibration.estimation.solution import Solution, shrunk, tolerances_of, with_weak_replaced
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_window
 from imu_calibration.kinematics.table import Table
@@ -174,8 +182,9 @@ def conclude(solution: Solution, gathered: Gathered, model: SensorModel, *, tabl
     needed = motions_needed(solution, tolerances, table)
     uncorrected = uncorrected_on_table(solution.model.at(solution.values), solution.values, gathered.accumulator, gathered=model)
     proof = prove_solution(gathered.held_out, solution, model, centre=uncorrected.centre)
-    calibration = document(solution, tolerances, table, gathered=gathered, needed=needed, provenance=provenance, proof=proof,
-                           changes=changes, uncorrected=uncorrected)
+    calibration = document(solution, tolerances, gathered, gravity=table.gravity_value, gauge=gauge_of(solution.model),
+                           undetermined=weak_on_table(solution, tolerances, needed), statistics=statistics(solution, gathered),
+                           provenance=provenance, proof=proof, changes=changes, uncorrected=uncorrected)
     return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options, solution=solution,
                        table=table, model=solution.model, gathered_model=model)
 

@@ -29,11 +29,6 @@ def total(terms: Terms) -> np.ndarray:
     return np.sum(list(terms.values()), axis=0)
 
 
-def sd_without(terms: Terms, name: str) -> np.ndarray:
-    """Return the standard deviations from all terms but one, shape (n_params,)."""
-    return np.sqrt(np.diag(total(terms) - terms[name]))
-
-
 def with_term(terms: Terms, name: str, covariance: np.ndarray) -> dict[str, np.ndarray]:
     """Return the terms with a covariance added to one of them."""
     return {**terms, name: terms.get(name, 0.0) + covariance}

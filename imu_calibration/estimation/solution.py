@@ -4,11 +4,12 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.covariance_terms import Terms, of_fit, total
+from imu_calibration.estimation.covariance_terms import Terms, of_fit, replace_weak, total
 from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.weighted_system import make_prior
@@ -81,6 +82,9 @@ def tolerances_of(model: SensorModel, overrides: dict | None = None) -> np.ndarr
 class Solution:
     """Estimated parameters with covariance, noise and quality of the fit."""
 
+    judged_without: ClassVar[tuple[str, ...]] = ()
+    """Terms of the covariance that have a status together, and do not count for that of each parameter."""
+
     model: SensorModel
     """The effects, linearised at the values of the columns."""
     values: np.ndarray
@@ -130,9 +134,46 @@ class Solution:
         """Standard deviations, shape (n_params,)."""
         return np.sqrt(np.diag(self.covariance))
 
-    def value(self, sensor: str, effect: str) -> np.ndarray:
-        """Return the values of one effect."""
-        return self.values[self.model.slices[sensor, effect]]
+    @property
+    def judged_sd(self) -> np.ndarray:
+        """Standard deviations that are compared with the tolerances, shape (n_params,)."""
+        return np.sqrt(np.diag(total({name: term for name, term in self.terms.items() if name not in self.judged_without})))
+
+    @property
+    def prior_mean(self) -> np.ndarray:
+        """Values before any data, shape (n_params,)."""
+        return make_prior(self.model).mean
+
+    @property
+    def replacement_limit(self) -> np.ndarray | float:
+        """Largest ``(value - prior)^2 / variance`` of a weak parameter that is replaced by its prior (`replace_weak`)."""
+        return 1.0
+
+    def value(self, name: str) -> float:
+        """Return the parameter called `name`."""
+        return float(self.values[self.param_names.index(name)])
+
+    def sd_of(self, name: str) -> float:
+        """Return the standard deviation of the parameter called `name`."""
+        return float(self.sd[self.param_names.index(name)])
+
+
+AnySolution = TypeVar('AnySolution', bound=Solution)
+
+
+def with_weak_replaced(solution: AnySolution, tolerances: np.ndarray) -> AnySolution:
+    """
+    Return the solution with weak values that compensation applies replaced by their prior where that lowers the expected error.
+
+    See `replace_weak`. A replaced parameter is held.
+    """
+    effects = solution.model.effects
+    applied = np.repeat([e.compensation == 'exact' for e in effects], [e.size for e in effects])
+    weak = np.flatnonzero(applied & ~solution.held & (solution.judged_sd > tolerances))
+    values, terms, replaced = replace_weak(solution.values, solution.terms, solution.prior_mean, weak=weak.tolist(),
+                                           limit=solution.replacement_limit)
+    return replace(solution, values=values, terms=terms, held=solution.held | replaced,
+                   replaced=tuple(np.array(solution.param_names)[replaced].tolist()))
 
 
 CONVENTION_SHARE = 1e-9

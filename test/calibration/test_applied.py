@@ -132,7 +132,7 @@ def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
     calibration = result.calibration
     assert calibration.statistics['uncorrected'][0]['applied'] == MEAN
     truth = session.truth.value('gyroscope', 'bias') + mean
-    uncentred = result.solution.value('gyroscope', 'bias')
+    uncentred = result.solution.values[result.model.slices['gyroscope', 'bias']]
     assert np.abs(calibration.value('gyroscope', 'bias') - truth).max() < 0.01 * DEG
     assert calibration.proof['gyroscope']['after'] < 0.05 * DEG
     part = calibration.model.slices['gyroscope', 'by_angle']

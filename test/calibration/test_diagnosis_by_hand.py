@@ -195,7 +195,7 @@ def test_the_document_and_the_extended_model_go_together(responding):
     document = to_mapping(responding.diagnosis)
     json.dumps(document)
     assert document['findings'][0]['gain']['measure'] == 'poses'
-    assert 'gyro_g_sensitivity' in responding.hand.model.model.gyroscope
+    assert 'gyro_g_sensitivity' in responding.hand.model.gyroscope
     untestable = {entry['effect'] for entry in document['not_testable']}
     assert {'accel_size_effect', 'table_tilt', 'accel_thermal_bias', 'gyro_saturation'} <= untestable
 

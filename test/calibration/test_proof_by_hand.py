@@ -39,7 +39,7 @@ def test_a_part_is_left_out_as_if_it_had_not_been_recorded(session):
     rest = [replace(turn, first=int(place[turn.first]), last=int(place[turn.last])) for turn in session.turns if not (out[turn.first] or out[turn.last])]
     parts = {name: getattr(session.poses, name)[~out] for name in ('force', 'rate', 'force_sem', 'rate_sem', 'start', 'stop', 'time')}
     again = solve_by_hand(replace(session, poses=replace(session.poses, **parts), turns=rest), OPTIONS)
-    free, sd = ~hand.model.fixed, hand.sd[~hand.model.fixed]
+    free, sd = ~hand.hand_model.fixed, hand.sd[~hand.hand_model.fixed]
     moved = (again.values - hand.values)[free] / sd
     assert np.abs(moved).max() > 0.5
     assert np.abs((step - again.values)[free] / sd).max() < 0.35 * np.abs(moved).max()

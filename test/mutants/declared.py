@@ -198,7 +198,7 @@ HAND = _of(
      'test_hand_faults.py::test_a_warm_up_is_not_sold_as_g_sensitivity test_hand_faults.py::test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_in_order'),
     ('the Earth answers to gravity', 'g_sensitivity_evidence', 'np.clip(_1, -EARTH_RATE, EARTH_RATE)', 'np.clip(_1, 0, 0)',
      'test_hand_faults.py::test_the_earth_is_not_sold_as_g_sensitivity'),
-    ('what is held is asked for by other names', 'investigate_by_hand', '_1.model.size + 1', '12',
+    ('what is held is asked for by other names', 'investigate_by_hand', '_1.hand_model.size + 1', '12',
      'test_diagnosis_by_hand.py::test_what_held_parameters_may_be_is_no_finding'),
     ('drifts do not widen sds by hand', 'with_movement', '(_1.size / 2) ** 2', '0',
      'test_hand_faults.py::test_biases_that_drift_carry_it_in_their_sd_and_a_note_with_its_size'),

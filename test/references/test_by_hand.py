@@ -19,7 +19,7 @@ from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.equations import GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence
-from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
+from imu_calibration.references.gravity.hand_calibration import GAUGE, calibrate_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions, KnownTurn, hand_options
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.options import CalibrationOptions
@@ -263,7 +263,7 @@ def test_impossible_places_are_refused(given, code, values):
 def test_axes_follow_the_gauge():
     imu, ranges, _ = simulate(8)
     found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
-    assert found.gauge['axes'] == 'accelerometer_lower_triangular'
+    assert GAUGE['axes'] == 'accelerometer_lower_triangular'
     for name in ('xy', 'xz', 'yz'):
         assert found.value(f'accelerometer.matrix.{name}') == 0.0 and found.sd_of(f'accelerometer.matrix.{name}') == 0.0
 
@@ -289,7 +289,7 @@ def test_six_faces_leave_the_cross_axis_terms_held_and_say_what_to_do(monkeypatc
     for name in ('yx', 'zx', 'zy'):
         full = f'accelerometer.matrix.{name}'
         assert status[full] == 'held' and found.value(full) == 0.0
-        assert found.sd_of(full) == found.priors[found.param_names.index(full)]
+        assert found.sd_of(full) == found.hand_model.priors[found.param_names.index(full)]
     assert status['accelerometer.matrix.xx'] != 'held' and status['accelerometer.bias.z'] != 'held'
     advice = missing_motion(found)[0]
     needs = advice['needs']
@@ -382,7 +382,7 @@ def heldout_norm_rms(imu, ranges, gravity, **options):
     kept = [r for k, r in enumerate(ranges) if k % 3]
     found = calibrate_by_hand(imu, HandOptions(gravity), kept, **options)
     left_out = np.array([imu.force_s[r].mean(0) for r in ranges[::3]])
-    return float(np.sqrt(np.mean(found.model.norm_rows(found.state.values, left_out)[0]**2)))
+    return float(np.sqrt(np.mean(found.hand_model.norm_rows(found.values, left_out)[0]**2)))
 
 
 @pytest.mark.real_data

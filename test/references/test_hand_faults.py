@@ -13,13 +13,13 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.estimation.covariance_terms import of_fit
-from imu_calibration.estimation.solution import reasons_held
+from imu_calibration.estimation.solution import reasons_held, with_weak_replaced
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
-from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand, with_weak_replaced
+from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions, hand_options
 from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, UPPER
 from imu_calibration.references.gravity.poses import average_poses
@@ -233,7 +233,7 @@ def test_a_weak_cross_term_is_zero_unless_zero_is_significantly_worse():
     for ratio, moves in ((1.8, True), (2.2, False)):
         at = np.arange(len(hand.values)) == hand.param_names.index(name)
         other = replace(hand, values=np.where(at, ratio * np.sqrt(np.diag(of_fit(hand.terms))), hand.values))
-        assert (name in with_weak_replaced(other).replaced) == moves
+        assert (name in with_weak_replaced(other, other.tolerances).replaced) == moves
     assert reasons_held([True], [name], [name], tested=CROSS_TERMS) == {name: 'likelihood ratio'}
 
 
@@ -305,4 +305,4 @@ def test_an_unknown_gravity_does_not_change_the_recommended_poses():
     imu, ranges, _ = hold_and_turn(3, n_poses=6)
     unknown, given = (calibrate_by_hand(imu, HandOptions(STANDARD_GRAVITY, sd), ranges) for sd in (STANDARD_GRAVITY_SD, 0.0))
     assert missing_motion(unknown) == missing_motion(given) != ()
-    assert with_weak_replaced(unknown).replaced == with_weak_replaced(given).replaced
+    assert with_weak_replaced(unknown, unknown.tolerances).replaced == with_weak_replaced(given, given.tolerances).replaced

@@ -21,9 +21,9 @@ def test_a_gyroscope_whose_scale_walks_is_not_known_to_the_noise(seed):
     imu, ranges, _ = hold_and_turn(seed, n_poses=24, rate_hz=50.0)
     walk = np.linspace(0, 0.02, len(imu))[:, None]
     walking, steady = (calibrate_by_hand(replace(imu, rate_s=rate), HandOptions(GRAVITY), ranges) for rate in (imu.rate_s * (1 + walk), imu.rate_s))
-    own = steady.model.gyro_matrix
+    own = steady.hand_model.gyro_matrix
     assert not steady.model_error.drift_variance[own].any() and steady.model_error.factor[own].max() == 1.0
-    assert np.sqrt(walking.model_error.drift_variance[walking.model.gyro_matrix].max()) > 2e-3
+    assert np.sqrt(walking.model_error.drift_variance[walking.hand_model.gyro_matrix].max()) > 2e-3
     assert max(walking.sd_of(name) for name in MATRIX) > 10 * max(steady.sd_of(name) for name in MATRIX)
 
 

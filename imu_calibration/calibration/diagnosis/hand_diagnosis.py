@@ -12,7 +12,6 @@ from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
 from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.estimation.solution import HELD, Solution
 from imu_calibration.references.gravity.effect_rows import Block
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.model_selection import HandInvestigation
@@ -70,22 +69,16 @@ PER_TURN = 'rad/turn'
 """Unit of the residual of turns: the angle between predicted and measured gravity after a turn."""
 
 
-def as_solution(hand: HandCalibration) -> Solution:
-    """Return a HandCalibration as the `Solution` of documents and reports."""
-    model = hand.model.model
-    noise, rms, chi2 = {}, {}, {}
+def _with_residuals(hand):
+    """Return the HandCalibration with the rms residual of its poses."""
     residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': _rates_left(hand)}
-    for sensor, scatter in (('accelerometer', 'pose'), ('gyroscope', 'drift')):
-        noise[sensor] = replace(hand.poses.noise[sensor], offset_sd=hand.statistics[f'{scatter}_scatter_sd'])
-        rms[sensor] = np.full(2, np.sqrt(np.mean(residuals[sensor]**2)))
-        chi2[sensor] = {'mean': None}
-    return Solution(model, hand.values, hand.terms, np.array(hand.statuses) == HELD, noise, chi2, hand.information, rms)
+    return replace(hand, residual_rms={sensor: np.full(2, np.sqrt(np.mean(residual**2))) for sensor, residual in residuals.items()})
 
 
 def _rates_left(hand):
     """Return the residual rates at rest, shape (k, 3)."""
     poses, true = hand.poses, hand.gravity * hand.state.up
-    more = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time,
+    more = hand.hand_model.further('gyroscope', hand.values, true, rate=np.zeros_like(true), time=poses.time,
                               temperature_c=poses.temperature_c)[0]
     return poses.rate - hand.gyroscope[0] - more
 
@@ -145,7 +138,7 @@ def _explanations(hand):
 def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
     """Return the result of an investigation as a Diagnosis; `hand` is a calibration with all findings."""
     inquiry, named = found.inquiry, list(found.named)
-    before, after = as_solution(found.baseline), as_solution(hand)
+    before, after = _with_residuals(found.baseline), _with_residuals(hand)
 
     def gain_of(place):
         return gain_by_hand(found, named[:place], after=named[:place + 1], sensor=named[place].sensor)

@@ -76,10 +76,10 @@ def build_rows(hand: HandCalibration, turns: Sequence[TurnData], effects: Sequen
     """
     sets: list[tuple[Effect, str, float | None]] = [(effect, effect.name, None) for effect in effects if not effect.time_constant]
     sets += [(e, f'{e.name}@{k}', float(tau)) for e in effects if e.time_constant for k, tau in enumerate(constants)]
-    base = hand.model.size
+    base = hand.hand_model.size
     sizes = [len(effect.amplitudes(effect.components)) for effect, _, _ in sets]
     ends = np.cumsum([base + 1] + sizes)
-    widths = np.concatenate([1e3 * hand.model.priors, [EARTH_UPWARDS_SD], *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes))])
+    widths = np.concatenate([1e3 * hand.hand_model.priors, [EARTH_UPWARDS_SD], *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes))])
     parts = {label: slice(a, b) for (_, label, _), a, b in zip(sets, ends, ends[1:])}
     space = HandSpace(tuple(parts), parts, widths, int(ends[-1]))
     at_rest = {label: _columns(hand, effect, tau, hand.gravity * hand.state.up, np.zeros_like(hand.state.up), hand.poses.time,
@@ -102,8 +102,8 @@ def _columns(hand, effect, tau, force, rate, time, temperature_c):
     """Return the contribution of the effect's parameters to its sensor's output, shape (m, 3, p), at the baseline's solution."""
     point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
     names = {sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS}
-    model = HandModel(replace(hand.model.model, **names, point=point), hand.gravity)
-    values = model.model.start_from(hand.model.model, hand.state.values)
+    model = HandModel(replace(hand.model, **names, point=point), hand.gravity)
+    values = model.model.start_from(hand.model, hand.values)
     return model.further(effect.sensor, values, force, rate=rate, time=time, temperature_c=temperature_c)[1]
 
 
@@ -115,7 +115,7 @@ def _natural(poses, sensor):
 def _norm_block(hand, space, at_rest, sensor_of):
     """One row per pose: ``|true force| - gravity``."""
     poses, count = hand.poses, len(hand.poses.start)
-    residual, base = hand.model.norm_rows(hand.state.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
+    residual, base = hand.hand_model.norm_rows(hand.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
     back = base[:, 0:3]
     rows = np.zeros((count, space.size + 1))
     rows[:, :base.shape[1]], rows[:, -1] = base, residual
@@ -131,12 +131,12 @@ def _rest_block(hand, space, at_rest, sensor_of):
     """Three rows per pose: the rate at rest, with the Earth's rate about the vertical."""
     poses, count = hand.poses, len(hand.poses.start)
     true = hand.gravity * hand.state.up
-    more, slopes = hand.model.further('gyroscope', hand.state.values, true, rate=np.zeros_like(true), time=poses.time,
+    more, slopes = hand.hand_model.further('gyroscope', hand.values, true, rate=np.zeros_like(true), time=poses.time,
                                       temperature_c=poses.temperature_c)
     rows = np.zeros((count, 3, space.size + 1))
-    rows[:, :, hand.model.gyro_bias] = np.eye(3)
-    rows[:, :, hand.model.size] = hand.state.up
-    rows[:, :, hand.model.extra_index('gyroscope')] = slopes
+    rows[:, :, hand.hand_model.gyro_bias] = np.eye(3)
+    rows[:, :, hand.hand_model.size] = hand.state.up
+    rows[:, :, hand.hand_model.extra_index('gyroscope')] = slopes
     rows[:, :, -1] = poses.rate - hand.gyroscope[0] - more
     for label, columns in at_rest.items():
         if sensor_of[label] == 'gyroscope':
@@ -167,7 +167,7 @@ def _turn_block(hand, turns, space, at_rest, moving):
         carried = between_middles(hand.poses, turn, found.mat_ji) @ hand.state.up[i]
         by_psi = across[j].T @ skew(carried) / found.duration
         row = np.zeros((2, space.size + 1))
-        row[:, hand.model.gyro_matrix] = by_psi @ found.by_matrix.reshape(3, 9)
+        row[:, hand.hand_model.gyro_matrix] = by_psi @ found.by_matrix.reshape(3, 9)
         place = 0
         for effect in moving:
             row[:, space.parts[effect.name]] = by_psi @ found.by_further[:, place:place + effect.size]

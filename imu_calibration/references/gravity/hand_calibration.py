@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 
@@ -11,9 +11,8 @@ from imu_calibration.core.progress import report
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
-from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, Terms, replace_weak, sd_without, total, with_term
-from imu_calibration.estimation.model_error import ModelError
-from imu_calibration.estimation.solution import HELD, statuses, tolerances_of
+from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, total, with_term
+from imu_calibration.estimation.solution import Solution, Status, statuses, tolerances_of
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import bias_movements, with_movement, without_movement
 from imu_calibration.references.gravity.equations import COMPONENTS, SCATTER_SD, Poses, State
@@ -39,89 +38,72 @@ POSES_FULL = 12
 """The nine accelerometer parameters need one equation per attitude; further ones determine the scatter of the poses."""
 
 
-@dataclass(frozen=True, eq=False)
-class HandCalibration:
-    """Forward model ``measured = bias + matrix @ true (+ g-sensitivity @ force)`` of both sensors, with its uncertainty."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HandCalibration(Solution):
+    """Solution of ``measured = bias + matrix @ true (+ further effects)`` of both sensors with gravity as the reference."""
 
-    param_names: tuple
-    """SENSOR.EFFECT.COMPONENT; matrix components are row, column."""
-    values: np.ndarray
-    """Parameters in `param_names` order, SI, shape (n,)."""
-    terms: Terms
-    """Covariance of `values` as named terms (`covariance_terms`), each of shape (n, n)."""
-    statuses: tuple
-    """'determined', 'weak' or 'held' for each parameter."""
+    judged_without = (GRAVITY,)
+
+    hand_model: HandModel
+    """The model with gravity; its effects are those of `model`."""
     tolerances: np.ndarray
     """Sufficient standard deviation, shape (n,)."""
-    priors: np.ndarray
-    """Sd before any data, shape (n,)."""
-    gravity: float
-    """Reference, m/s^2."""
-    gauge: dict
-    """Conventions of origin and axes."""
     statistics: dict
     """Counts, noise, scatter, chi-square: plain numbers."""
     poses: Poses
     """The poses that were used."""
     state: State
-    """Directions and drifts of the poses, and the parameters in the order of `model`."""
-    model: HandModel
-    """Estimated parameters."""
-    information: np.ndarray
-    """Information of the data without priors, in the order of `model`, shape (m, m)."""
+    """Directions and drifts of the poses, and the parameters."""
     used_poses: Poses
     """The poses as weighted: excluded ones with negligible weight, a drifting bias at its mean."""
     used_turns: list
     """`TurnData` without excluded turns."""
-    model_error: ModelError
-    """Increase of the covariance beyond noise and scatter, in the order of `model`."""
-    replaced: tuple[str, ...] = ()
-    """Weak parameters that were replaced by their prior."""
-
-    @cached_property
-    def covariance(self) -> np.ndarray:
-        """Covariance of `values`, the sum of its terms, shape (n, n)."""
-        return total(self.terms)
 
     @property
-    def sd(self) -> np.ndarray:
-        """Standard deviation of each parameter, shape (n,)."""
-        return np.sqrt(np.diag(self.covariance))
+    def gravity(self) -> float:
+        """Reference, m/s^2."""
+        return self.hand_model.gravity
 
     @property
-    def own_sd(self) -> np.ndarray:
-        """Standard deviation of each parameter relative to gravity as used, without its uncertainty (`common_scale`), shape (n,)."""
-        return sd_without(self.terms, GRAVITY)
+    def prior_mean(self) -> np.ndarray:
+        """Values before any data, shape (n,)."""
+        return self.hand_model.nominal
 
-    def value(self, name: str) -> float:
-        """Return the parameter called `name`."""
-        return float(self.values[self.param_names.index(name)])
+    @property
+    def replacement_limit(self) -> np.ndarray:
+        """
+        Likelihood ratio for cross terms of the accelerometer, otherwise the smallest expected error.
 
-    def sd_of(self, name: str) -> float:
-        """Return the standard deviation of the parameter called `name`."""
-        return float(self.sd[self.param_names.index(name)])
+        Near the six faces the poses determine cross terms only through small tilts.
+        """
+        return np.where(np.isin(self.param_names, CROSS_TERMS), SIGNIFICANT, 1.0)
+
+    @property
+    def statuses(self) -> tuple[Status, ...]:
+        """Status of each parameter relative to gravity as used, without its uncertainty (`common_scale`)."""
+        return statuses(self.judged_sd, self.held, self.tolerances)
 
     @property
     def accelerometer(self) -> tuple[np.ndarray, np.ndarray]:
         """(bias, matrix) of the accelerometer."""
-        return self.model.linear(self.state.values)[:2]
+        return self.hand_model.linear(self.values)[:2]
 
     @property
     def gyroscope(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity."""
-        effect = self.model.model.find('gyroscope', Role.CROSS)
-        response = np.zeros((3, 3)) if effect is None else self.state.values[self.model.model.slices[effect.key]].reshape(3, 3)
-        return *self.model.linear(self.state.values)[2:], response
+        effect = self.model.find('gyroscope', Role.CROSS)
+        response = np.zeros((3, 3)) if effect is None else self.values[self.model.slices[effect.key]].reshape(3, 3)
+        return *self.hand_model.linear(self.values)[2:], response
 
     def compensate(self, force: np.ndarray, rate: np.ndarray, time: np.ndarray | None = None, *,
                    temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return true specific force and rate for readings of shape (n, 3), at `time` s and `temperature_c` for effects that need them."""
-        return self.model.compensate(self.state.values, force, rate, time=time, temperature_c=temperature_c)
+        return self.hand_model.compensate(self.values, force, rate, time=time, temperature_c=temperature_c)
 
     def norm_residuals(self) -> np.ndarray:
         """Return ``|compensated force| - gravity`` of the poses, shape (k,)."""
         poses = self.poses
-        return self.model.norm_rows(self.state.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0]
+        return self.hand_model.norm_rows(self.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0]
 
 
 def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), stills: Sequence | None = None, *,
@@ -226,33 +208,18 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
     used, poses = poses, data.poses   # the result has all poses unchanged, also excluded and drifting ones
     goals = tolerances_of(model.model, options.tolerances)
-    status = statuses(sd_without(terms, GRAVITY), found.held, goals)
     statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
                   'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()},
                   **_statistics(model, found, poses, turns)}
     if options.gravity_sd:
         sd, goal = options.gravity_sd / options.gravity, float(goals[3])
         statistics['common_scale'] = {'sd': sd, 'tolerance': goal, 'status': str(statuses([sd], [False], [goal])[0])}
-    return HandCalibration(tuple(model.model.param_names), found.state.values, terms, status, goals, model.priors, options.gravity,
-                           dict(GAUGE), statistics, poses, found.state, model, found.factor.T @ found.factor, used, turns,
-                           error)
-
-
-def with_weak_replaced(hand: HandCalibration) -> HandCalibration:
-    """
-    Return the calibration with weak values replaced by their prior (`replace_weak`).
-
-    Cross terms of the accelerometer are replaced if zero is not significantly worse by the likelihood ratio, because near the six faces
-    the poses determine them only through small tilts; other parameters where that lowers the expected error.
-    """
-    held = np.array([status == HELD for status in hand.statuses])
-    applied = {name for effect in hand.model.model.effects if effect.compensation == 'exact' for name in effect.param_names()}
-    weak = np.flatnonzero(~held & (hand.own_sd > hand.tolerances) & np.isin(hand.param_names, list(applied)))
-    values, terms, replaced = replace_weak(hand.values, hand.terms, hand.model.nominal, weak=weak.tolist(),
-                                           limit=np.where(np.isin(hand.param_names, CROSS_TERMS), SIGNIFICANT, 1.0))
-    return replace(hand, values=values, terms=terms, state=replace(hand.state, values=values),
-                   replaced=tuple(np.array(hand.param_names)[replaced].tolist()),
-                   statuses=statuses(sd_without(terms, GRAVITY), held | replaced, hand.tolerances))
+    noise = {sensor: replace(poses.noise[sensor], offset_sd=statistics[f'{name}_scatter_sd'])
+             for sensor, name in zip(SENSORS, COMPONENTS)}
+    return HandCalibration(
+        model=model.model, values=found.state.values, terms=terms, held=found.held, noise=noise, residual_rms={}, model_error=error,
+        chi2_per_dof={sensor: {'mean': None} for sensor in SENSORS}, information=found.factor.T @ found.factor, hand_model=model,
+        tolerances=goals, statistics=statistics, poses=poses, state=found.state, used_poses=used, used_turns=turns)
 
 
 def _settled(model, found):

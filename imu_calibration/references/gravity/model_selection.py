@@ -137,14 +137,14 @@ class HandInvestigation(Named):
         `inquiry` has the rows for the estimate, those of this investigation or fewer.
         """
         hand, point, fit = self.baseline, self.point(inquiry, chosen), inquiry.values(chosen)
-        base = hand.model.model
+        base = hand.model
         names = {sensor: getattr(base, sensor) + tuple(q.name for q in chosen if q.sensor == sensor) for sensor in SENSORS}
-        model = replace(hand.model, model=replace(base, **names, point={**base.point, **point}))
-        values = model.model.start_from(base, hand.state.values + fit[:hand.model.size])
+        model = replace(hand.hand_model, model=replace(base, **names, point={**base.point, **point}))
+        values = model.model.start_from(base, hand.values + fit[:hand.hand_model.size])
         for question in chosen:
             if question.name not in point:
                 values[model.model.slices[question.effect.key]] = fit[list(question.parameters)]
-        return model, values, fit[hand.model.size]
+        return model, values, fit[hand.hand_model.size]
 
 
 def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) -> HandInvestigation:
@@ -173,10 +173,10 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
         raise too_few_poses(len(poses.start))
     baseline = solve_by_hand(data, replace(options, accelerometer=options.accelerometer or BASE, gyroscope=options.gyroscope or BASE))
     follows_gravity = shown(g_sensitivity_evidence(poses))
-    effects, not_testable = sort_effects(baseline.model.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity))
+    effects, not_testable = sort_effects(baseline.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity))
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
-    base = tuple(range(baseline.model.size + 1))   # including fixed parameters and the Earth's rate: their uncertainty is no finding
+    base = tuple(range(baseline.hand_model.size + 1))   # including fixed parameters and the Earth's rate: their uncertainty is no finding
     questions = _questions(effects, blocks, space, base, not_testable)
     inquiry = Inquiry(blocks, space, questions, baseline=base)
     named = inquiry.named()
