@@ -55,7 +55,7 @@ setup(
     python_requires='>=3.11',
     install_requires=[
         # The oldest versions that are tested, constraints/oldest.txt; a test compares.
-        'numpy>=1.26', 'scipy>=1.11', 'PyYAML>=6.0.1', 'matplotlib>=3.6', 'Jinja2>=3.1.2', 'rich>=13.7', 'rosbags>=0.11',
+        'numpy>=1.26', 'scipy>=1.11', 'PyYAML>=6.0.1', 'matplotlib>=3.6', 'Jinja2>=3.1.2', 'tqdm>=4.66', 'rosbags>=0.11',
         'lz4>=4.4', 'backports.zstd>=1.8; python_version < "3.14"',
     ],
     # urdfdom-py brings lxml (12 MB), which only robot descriptions need.

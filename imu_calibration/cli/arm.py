@@ -22,7 +22,8 @@ def run(options: Namespace) -> VerbResult:
     """Estimate and print."""
     from imu_calibration.between_imus.arm import estimate_arm
     from imu_calibration.calibration.hand_workflow import read_imu
-    from imu_calibration.cli.show import console, warn
+    from imu_calibration.cli.show import warn
+    from imu_calibration.cli.terminal import Terminal
     from imu_calibration.core.units import with_sd
     from imu_calibration.preprocessing.checks import Preflight, warnings
     from imu_calibration.use_cases.recordings import Topics, open_bag, source_of
@@ -44,7 +45,7 @@ def run(options: Namespace) -> VerbResult:
         warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(preflight.findings))
     first, second = imus
     result = estimate_arm(first, second)
-    out = console()
+    out = Terminal.standard()
     for axis, value, sd in zip('xyz', result.arm, result.arm_sd):
         shown, spread = with_sd(value * 1e3, sd * 1e3)
         out.print(f'{axis}: {shown} +- {spread} mm')

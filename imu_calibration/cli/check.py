@@ -20,14 +20,15 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Print the errors before and after with their interval and the decision; exit code 0 when it helps each sensor, otherwise 3."""
-    from imu_calibration.cli.show import console, show_table, warn
+    from imu_calibration.cli.show import show_table, warn
+    from imu_calibration.cli.terminal import Terminal
     from imu_calibration.core.units import error_text
     from imu_calibration.document.decision import ratio_text
     from imu_calibration.preprocessing.checks import warnings
     from imu_calibration.use_cases.check import check
     found = check(options.bag, options.calibration, stand_of(options), **choices_of(options))
     warn([finding.to_mapping() for finding in warnings(found.findings)])
-    out, numbers = console(), ('seconds', 'before', 'after', 'after / before, 95 %')
+    out, numbers = Terminal.standard(), ('seconds', 'before', 'after', 'after / before, 95 %')
     rows = []
     for sensor, entry in found.proof.items():
         for motion, part in (('all', entry), *entry['regimes'].items()):
@@ -36,5 +37,5 @@ def run(options: Namespace) -> VerbResult:
                          ratio_text(part)))
     show_table(out, ('sensor', 'motion', *numbers), rows, numbers=numbers)
     for line in str(found).splitlines():
-        out.print(line, markup=False)
+        out.print(line)
     return VerbResult(found.exit_code, {'proof': found.proof, 'helps': found.helps})

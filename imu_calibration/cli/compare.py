@@ -15,11 +15,12 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Compare and print."""
-    from imu_calibration.cli.show import console, show_table
+    from imu_calibration.cli.show import show_table
+    from imu_calibration.cli.terminal import Terminal
     from imu_calibration.core.units import for_people, with_sd
     from imu_calibration.document import comparison, files
     result = comparison.compare(files.read_calibration(options.first), files.read_calibration(options.second))
-    out = console()
+    out = Terminal.standard()
     numbers = ('A', 'B', 'B - A', 'combined sd', 'in sd')
     shown = []
     for row in result.rows:

@@ -23,7 +23,8 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Diagnose into a folder that can be written, print the findings, return the exit code."""
-    from imu_calibration.cli.show import console, warn
+    from imu_calibration.cli.show import warn
+    from imu_calibration.cli.terminal import Terminal
     from imu_calibration.document import files
     from imu_calibration.use_cases.diagnose import diagnose
     from imu_calibration.use_cases.view import foxglove
@@ -36,7 +37,7 @@ def run(options: Namespace) -> VerbResult:
         found.save(folder)
         if options.mcap:
             found.save_overlay(options.mcap)
-        out = console()
+        out = Terminal.standard()
         out.print(str(found))
         also = '' if found.proposed is None else ', and extended.yaml with the proposed formula in the model,'
         out.print(f'written: diagnosis.json, calibration.yaml and report.html{also} in {folder}')

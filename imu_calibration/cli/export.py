@@ -46,9 +46,10 @@ def run(options: Namespace) -> VerbResult:
 
 
 def _show_targets():
-    from imu_calibration.cli.show import console, show_table
+    from imu_calibration.cli.show import show_table
+    from imu_calibration.cli.terminal import Terminal
     from imu_calibration.document.exports.export import all_targets, holds_in_words
     rows = [(target.name, target.title, holds_in_words(target), target.noise_is or '-', 'yes' if target.read else '-')
             for target in all_targets().values() if target.write is not None]
-    show_table(console(), ('name', 'file', 'of the calibration it holds', 'noise', 'read'), rows)
+    show_table(Terminal.standard(), ('name', 'file', 'of the calibration it holds', 'noise', 'read'), rows)
     return [dict(zip(('name', 'file', 'holds', 'noise', 'import'), row, strict=True)) for row in rows]

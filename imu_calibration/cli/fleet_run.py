@@ -12,7 +12,8 @@ from typing import Any
 from imu_calibration.calibration.fleet import FleetStep, Spread, Unit, UnitResult, fleet_exit_code, summarise
 from imu_calibration.cli.arguments import choices_of, stand_of
 from imu_calibration.cli.parser import VerbResult, hints_of
-from imu_calibration.cli.show import console, show_table, warn
+from imu_calibration.cli.show import show_table, warn
+from imu_calibration.cli.terminal import Terminal
 from imu_calibration.core.errors import InputError, with_hint
 from imu_calibration.core.progress import counter
 from imu_calibration.core.units import for_people, significant, with_sd
@@ -177,10 +178,10 @@ COLUMNS = ('parameter', 'mean', 'spread', 'typical sd', 'unit', 'spread / sd', '
 
 def show_fleet(results: Sequence[UnitResult], spreads: Sequence[Spread], folder: Path, *, hints: dict[str, str]) -> None:
     """Print the spread of each parameter, the units, and where the files are."""
-    out = console()
+    out = Terminal.standard()
     show_table(out, COLUMNS, map(shown, spreads), numbers=[COLUMNS[k] for k in (1, 2, 3, 5)])
     for result in results:
-        out.print(f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict_text}', markup=False)
+        out.print(f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict_text}')
         if result.calibration is not None:
             warn({'text': f'{result.name}: {found["text"]}'} for found in result.calibration.statistics['preflight'])
     calibrated = sum(result.calibration is not None for result in results)

@@ -21,7 +21,8 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Read each Imu topic and print its properties; with a table also the motions and the parameters that they determine."""
-    from imu_calibration.cli.show import console, show_findings
+    from imu_calibration.cli.show import show_findings
+    from imu_calibration.cli.terminal import Terminal
     from imu_calibration.preprocessing.checks import refuse
     from imu_calibration.use_cases.choices import calibration_options, topics_of
     from imu_calibration.use_cases.inspect import imu_topics_of, inspect
@@ -31,7 +32,7 @@ def run(options: Namespace) -> VerbResult:
     topics = imu_topics_of(bag, topics_of(choices))
     table = None if stand is None else table_of(stand, [options.bag], Topics(topics[0].imu, frame=topics[0].frame))
     looks = inspect(bag, topics, table, options=calibration_options(choices))
-    out = console()
+    out = Terminal.standard()
     _show_topics(out, looks)
     _show_unread(out, looks[0].recording, hints_of(options))
     codes = []
@@ -39,7 +40,7 @@ def run(options: Namespace) -> VerbResult:
         out.print()
         if len(looks) > 1:
             frame = look.recording.frame_id
-            out.print(look.recording.imu_topic + ('' if frame is None else f' ({frame})'), style='bold', markup=False)
+            out.print(look.recording.imu_topic + ('' if frame is None else f' ({frame})'), style='bold')
         show_findings(out, look.findings, hints_of(options))
         for reason, count in look.lost.items():
             out.print(f'lost: {count} {reason}')
@@ -110,7 +111,7 @@ def _judge(out, look, hints):
     if result is None or look.refused:
         return 0
     if isinstance(result, ImuCalibrationError):
-        out.print(f'not usable for calibration: {result.told(hints)}', markup=False)
+        out.print(f'not usable for calibration: {result.told(hints)}')
         return 3
     out.print()
     for kind, count in result.calibration.statistics['windows'].items():
@@ -122,7 +123,7 @@ def _judge(out, look, hints):
 def _show_by_hand(out, found, hints):
     """Print whether the recording can be calibrated by hand, and which parameters that determines."""
     if isinstance(found, ImuCalibrationError):
-        out.print(f'not usable for calibration without a table: {found.told(hints)}', markup=False)
+        out.print(f'not usable for calibration without a table: {found.told(hints)}')
         return
     windows = found.calibration.statistics['windows']
     out.print(f'by hand, without a table, it determines, from {windows["static"]} poses and {windows["turns"]} turns between them:')

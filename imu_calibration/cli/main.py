@@ -6,18 +6,25 @@ import json
 import os
 import signal
 import sys
+import threading
 import time
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+SHARE, RUNNING = '{desc} {percentage:3.0f}% |{bar:40}| {elapsed}', '{desc} |{bar:40}| {elapsed}'
+"""Lines of progress with a known and an unknown total."""
+SWEEP, REFRESH = 10, 0.2
+"""Steps and seconds per step of the bar of an unknown total."""
+
 
 class ProgressBars:
-    """Listens to `imu_calibration.core.progress`; one bar per phase, removed at the end."""
+    """Listens to `imu_calibration.core.progress`: the bar of the present phase, removed at the end; it moves between reports too."""
 
     def __init__(self, *, verbose: bool = False):
-        self._verbose, self._tasks = verbose, {}
-        self._live: Any = None
+        self._verbose, self._ended = verbose, threading.Event()
+        self._bar: Any = None
+        self._total = 0.0
         self._phase, self._since = '', time.monotonic()
 
     def __enter__(self):
@@ -25,26 +32,35 @@ class ProgressBars:
 
     def __exit__(self, *exception):
         self._change('')
-        if self._live is not None:
-            self._live.stop()
+        self._ended.set()
+        if self._bar is not None:
+            self._refresher.join()
+            self._bar.close()
 
     def __call__(self, phase: str, done: float, total: float) -> None:
         """Show the amount done of a phase."""
-        if phase != self._phase:
+        new = phase != self._phase
+        if new:
             self._change(phase)
         if not sys.stderr.isatty():
             return
-        if self._live is None:
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-            self._live = Progress(TextColumn('{task.description}', markup=False), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
-                                  console=Console(stderr=True), transient=True)
-            self._live.start()
-        if phase not in self._tasks:
-            for task in self._tasks.values():
-                self._live.update(task, visible=False)
-            self._tasks[phase] = self._live.add_task(phase, total=None)
-        self._live.update(self._tasks[phase], completed=done, total=total or None, visible=True)
+        if self._bar is None:
+            from tqdm import tqdm
+            self._bar = tqdm(total=SWEEP, bar_format=RUNNING, leave=False, dynamic_ncols=True)
+            self._refresher = threading.Thread(target=self._refresh, name='progress', daemon=True)
+            self._refresher.start()
+        self._total, self._bar.total, self._bar.bar_format = total, total or SWEEP, SHARE if total else RUNNING
+        if new:
+            self._bar.set_description_str(phase, refresh=False)
+            self._bar.reset()
+        if total:
+            self._bar.n = min(done, total)
+
+    def _refresh(self):
+        while not self._ended.wait(REFRESH):
+            if not self._total:
+                self._bar.n = (self._bar.n + 1) % (SWEEP + 1)
+            self._bar.refresh()
 
     def _change(self, phase):
         if self._verbose and self._phase:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.terminal import STYLES, Cell, Terminal
 from imu_calibration.core.errors import InputError, printable
 
 EXAMPLES = ('', '--node /lab/calibration_node --once')
@@ -43,9 +44,6 @@ def run(options: Namespace) -> VerbResult:
 
 def _watch(watcher, options):
     """Wait for the node, then show it."""
-    from rich.live import Live
-
-    from imu_calibration.cli.show import console
     end = time.monotonic() + options.patience
     while not watcher.complete and time.monotonic() < end:
         watcher.spin(PERIOD)
@@ -53,15 +51,15 @@ def _watch(watcher, options):
         others = f' (heard: {", ".join(sorted(watcher.others))})' if watcher.others else ''
         raise InputError(f"'{options.node}' must run, no message on /diagnostics in {options.patience:g} s; start it, or name it "
                          f'with --node, as `ros2 node list` shows it{others}')
-    out = console()
+    out = Terminal.standard()
     if options.once or options.json:
-        out.print(watcher.screen())
+        out.write(watcher.screen(out))
         return VerbResult(0, {'node': watcher.name, 'status': {name: {'level': s.level, 'message': s.message, 'values': s.values}
                                                             for name, s in watcher.statuses.items()}})
-    with Live(watcher.screen(), console=out, refresh_per_second=4, transient=False) as live:
-        while time.monotonic() - watcher.heard < GONE:
-            watcher.spin(PERIOD)
-            live.update(watcher.screen())
+    drawn = out.redraw(watcher.screen(out), 0)
+    while time.monotonic() - watcher.heard < GONE:
+        watcher.spin(PERIOD)
+        drawn = out.redraw(watcher.screen(out), drawn)
     out.print(f'{watcher.name} has ended')
     return VerbResult(0, {'node': watcher.name})
 
@@ -111,9 +109,9 @@ class NodeWatcher:
         while (left := end - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=left)
 
-    def screen(self) -> Any:
-        """Return the present screen."""
-        return screen(self.name, self.statuses, self.picture)
+    def screen(self, out: Terminal) -> list[str]:
+        """Return the lines of the present screen."""
+        return screen(self.name, self.statuses, self.picture, out=out)
 
 
 BAR = 26
@@ -158,9 +156,9 @@ def bar(ratio: float, width: int = BAR) -> str:
     return ''.join(cells)
 
 
-def screen(node: str, statuses: dict[str, NodeStatus], picture: str) -> Any:
+def screen(node: str, statuses: dict[str, NodeStatus], picture: str, *, out: Terminal) -> list[str]:
     """
-    Return the screen, for a console of rich.
+    Return the lines of the screen.
 
     Parameters
     ----------
@@ -170,28 +168,22 @@ def screen(node: str, statuses: dict[str, NodeStatus], picture: str) -> Any:
         Name of the status, without the node's -> NodeStatus.
     picture : str
         The text line of the sphere of imu/coverage; '' without one.
+    out : Terminal
 
     """
-    from rich.console import Group
-    from rich.table import Table
-    from rich.text import Text
-
-    from imu_calibration.cli.show import STYLES
-    groups = {name: status for name, status in statuses.items() if name not in NOT_GROUPS}
-    table = Table(box=None, pad_edge=False, show_header=True, header_style='dim')
-    table.add_column('parameters', no_wrap=True)
-    table.add_column(f'{"":{round(BAR / 4)}}| determined', no_wrap=True)
-    table.add_column('x tolerance', justify='right', no_wrap=True)
-    for name, status in groups.items():
-        ratio = ratio_of(status)
-        style = 'dim' if math.isnan(ratio) else 'green' if ratio <= 1 else 'yellow'
-        table.add_row(name.replace('accelerometer', 'accel.').replace('gyroscope', 'gyro.'), Text(bar(ratio), style),
-                      '-' if math.isnan(ratio) else f'{ratio:.2g}')
-    lines: list[Any] = [Text(node, 'bold')]
+    lines = [out.styled(node, 'bold')]
     for title, name in (('streams', 'streams'), ('verdict', 'calibration'), ('finding', 'diagnosis')):
         if name in statuses:
             status = statuses[name]
-            lines.append(Text.assemble((f'{title}  ', 'dim'), (status.message.partition('; ')[0], STYLES[LEVELS[min(status.level, 2)]])))
-    lines += [table] * bool(groups)
-    lines += [Text.assemble(('next  ', 'dim'), (picture, 'bold'))] * bool(picture)
-    return Group(*lines)
+            lines += out.table([((title, 'dim'), (status.message.partition('; ')[0], STYLES[LEVELS[min(status.level, 2)]]))])
+    rows: list[list[Cell]] = []
+    for name, status in statuses.items():
+        if name not in NOT_GROUPS:
+            ratio = ratio_of(status)
+            style = 'dim' if math.isnan(ratio) else 'green' if ratio <= 1 else 'yellow'
+            rows.append([name.replace('accelerometer', 'accel.').replace('gyroscope', 'gyro.'), (bar(ratio), style),
+                         '-' if math.isnan(ratio) else f'{ratio:.2g}'])
+    if rows:
+        headings = ('parameters', f'{"":{round(BAR / 4)}}| determined', 'x tolerance')
+        lines += out.table([[(heading, 'dim') for heading in headings], *rows], right=[2])
+    return lines + (out.table([(('next', 'dim'), (picture, 'bold'))]) if picture else [])

@@ -25,7 +25,7 @@ def test_help_imports_no_heavy_module(verb):
     program = ('import sys\nfrom imu_calibration.cli.main import main\ntry:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n'
                'print(*{name.partition(".")[0] for name in sys.modules}, file=sys.stderr)')
     done = subprocess.run([sys.executable, '-c', program, verb, '--help'], cwd=ROOT, capture_output=True, text=True, check=True)
-    found = set(done.stderr.split()) & {'numpy', 'scipy', 'matplotlib', 'rich', 'yaml', 'rosbags', 'jinja2', 'rclpy'}
+    found = set(done.stderr.split()) & {'numpy', 'scipy', 'matplotlib', 'tqdm', 'yaml', 'rosbags', 'jinja2', 'rclpy'}
     assert found <= HELP_NEEDS.get(verb, set())
 
 

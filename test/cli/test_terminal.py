@@ -9,12 +9,14 @@ import struct
 import subprocess
 import sys
 import termios
+import threading
+import time
 
 import pytest
-from rich.console import Console
 
 from imu_calibration.cli import parser, show
-from imu_calibration.cli.main import main
+from imu_calibration.cli.main import ProgressBars, main
+from imu_calibration.cli.terminal import Terminal
 
 ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
 SESSION, TABLE, TRUTH = (f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml'))
@@ -28,7 +30,7 @@ def shown(monkeypatch, capsys, width, run):
     """Return the words that are printed on a terminal of a width; dotted names may break at a dot."""
     monkeypatch.setenv('COLUMNS', str(width))
     out = io.StringIO()
-    monkeypatch.setattr(show, 'console', lambda: Console(file=out, width=width, highlight=False, markup=False))
+    monkeypatch.setattr(Terminal, 'standard', classmethod(lambda cls: cls(out, width)))
     run()
     return (capsys.readouterr().out + out.getvalue()).replace('.', ' ').split()
 
@@ -52,10 +54,10 @@ def test_no_word_of_a_result_is_broken(verb, monkeypatch, capsys, tmp_path):
 
 
 def test_a_table_that_is_too_wide_breaks_between_words():
-    """Rich shrinks the widest column first: of 'acceleration' and 'accelerometer' it showed parts."""
+    """No column is narrower than its longest word."""
     out = io.StringIO()
     rows = [('accelerometer.accel_size_effect.xx', 'angular acceleration', '0.0463', ''), ('gyroscope.bias.x', 'turns at 30 to 120 deg/s', '12345.678', 'read')]
-    show.show_table(Console(file=out, width=48, highlight=False), ('parameter', 'motion', 'value', ''), rows, numbers=('value',))
+    show.show_table(Terminal(out, 48), ('parameter', 'motion', 'value', ''), rows, numbers=('value',))
     lines = out.getvalue().splitlines()
     assert max(map(len, lines)) <= 48
     assert set(out.getvalue().split()) == {'parameter', 'motion', 'value', *' '.join(cell.replace('.', ' ') if row.index(cell) == 0 else cell for row in rows for cell in row).split()}
@@ -64,8 +66,34 @@ def test_a_table_that_is_too_wide_breaks_between_words():
 @pytest.mark.parametrize(('width', 'name'), [(120, 'accelerometer.bias.x'), (24, 'accelerometer bias x')])
 def test_names_keep_their_dots_where_the_table_fits(width, name):
     out = io.StringIO()
-    show.show_table(Console(file=out, width=width, highlight=False), ('parameter', 'value', ''), [('accelerometer.bias.x', '1.0', '')])
+    show.show_table(Terminal(out, width), ('parameter', 'value', ''), [('accelerometer.bias.x', '1.0', '')])
     assert name.split()[-1] in out.getvalue() and ('accelerometer.bias.x' in out.getvalue()) == (width == 120)
+
+
+class Screen(io.StringIO):
+    """Standard error on a terminal."""
+
+    def isatty(self):
+        """Say so."""
+        return True
+
+
+def test_a_bar_has_the_name_of_its_phase_moves_between_reports_and_is_removed(monkeypatch):
+    screen = Screen()
+    monkeypatch.setattr(sys, 'stderr', screen)
+
+    def wait_for(*words):
+        end = time.monotonic() + 60.0   # far longer than the period of the bar, for a busy machine
+        while not all(word in screen.getvalue() for word in words) and time.monotonic() < end:
+            time.sleep(0.02)
+        assert all(word in screen.getvalue() for word in words)
+
+    with ProgressBars() as bars:
+        bars('solving', 0, 0)
+        wait_for('solving |#### ', 'solving |######## ')   # without a further report
+        bars('reading', 30, 40)
+        wait_for('reading  75% |' + 30 * '#')
+    assert screen.getvalue().rpartition('\r')[0].rpartition('\r')[2].strip() == '' and 'progress' not in [thread.name for thread in threading.enumerate()]
 
 
 def on_terminal(arguments, **environment):

@@ -9,8 +9,8 @@ import sys
 import time
 
 import pytest
-from rich.console import Console
 
+from imu_calibration.cli.terminal import Terminal
 from imu_calibration.cli.watch import BAR, NodeStatus, bar, ratio_of, screen
 
 STATUSES = {
@@ -26,7 +26,8 @@ STATUSES = {
 def shown(statuses=STATUSES, picture='hold it still with +x -y up, about 25 s left', width=80):
     """What stands on a terminal."""
     out = io.StringIO()
-    Console(file=out, width=width, highlight=False).print(screen('calibration_node', statuses, picture))
+    terminal = Terminal(out, width)
+    terminal.write(screen('calibration_node', statuses, picture, out=terminal))
     return out.getvalue()
 
 

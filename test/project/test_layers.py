@@ -15,7 +15,7 @@ FRONT_DOOR = ROOT / 'imu_calibration/__init__.py'
 """Imports the names for notebooks when they are asked for; test_front_door sees to it that it imports nothing by itself."""
 EDGE = {'cli', 'nodes', 'use_cases', '__main__'}
 ROS = {'rclpy', 'ros2cli', 'ros2doctor', 'rosbags', 'ament_index_python', 'launch', 'launch_ros', 'rosgraph_msgs', 'std_srvs'}
-LATE = {'yaml', 'matplotlib', 'jinja2', 'rich', 'urdf_parser_py', 'xacro'}
+LATE = {'yaml', 'matplotlib', 'jinja2', 'tqdm', 'urdf_parser_py', 'xacro'}
 LATE_OF_SCIPY = ('scipy.optimize', 'scipy.signal', 'scipy.stats')
 NOT_IN_CALIBRATE = ('allan', 'papers', 'planning')
 """They would take half of the time in which a command or a node starts."""

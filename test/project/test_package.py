@@ -26,13 +26,13 @@ FOREIGN = {'ekf_node', 'ekf_filter_node'}
 """Of robot_localization, started only where that is asked for."""
 ROSDEP_KEYS = {
     'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'yaml': 'python3-yaml', 'jinja2': 'python3-jinja2',
-    'matplotlib': 'python3-matplotlib', 'rich': 'python3-rich', 'rosbags': 'python3-rosbags-pip', 'urdf_parser_py': 'urdfdom_py',
+    'matplotlib': 'python3-matplotlib', 'tqdm': 'python3-tqdm', 'rosbags': 'python3-rosbags-pip', 'urdf_parser_py': 'urdfdom_py',
     # installed with those that need them; compression is in the standard library from Python 3.14 on
     'markupsafe': 'python3-jinja2', 'lz4': 'python3-rosbags-pip', 'backports': 'python3-rosbags-pip', 'compression': 'python3-rosbags-pip',
 }
 NOBLE = {
     'python3-numpy': 'python3-numpy', 'python3-scipy': 'python3-scipy', 'python3-yaml': 'python3-yaml', 'python3-jinja2': 'python3-jinja2',
-    'python3-matplotlib': 'python3-matplotlib', 'python3-rich': 'python3-rich', 'python3-rosbags-pip': 'rosbags', 'python3-hypothesis': 'python3-hypothesis',
+    'python3-matplotlib': 'python3-matplotlib', 'python3-tqdm': 'python3-tqdm', 'python3-rosbags-pip': 'rosbags', 'python3-hypothesis': 'python3-hypothesis',
     'python3-jsonschema': 'python3-jsonschema',
     'python3-pytest': 'python3-pytest', 'python3-pytest-xdist': 'python3-pytest-xdist', 'urdfdom_py': 'ros-jazzy-urdfdom-py', 'xacro': 'ros-jazzy-xacro',
     'ament_index_python': 'ros-jazzy-ament-index-python', 'launch': 'ros-jazzy-launch', 'launch_ros': 'ros-jazzy-launch-ros', 'rclpy': 'ros-jazzy-rclpy',

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures('few_candidates')
 ROOT = Path(__file__).resolve().parents[2]
 SESSION = ROOT / 'bags' / 'sample_session'
 TABLE = SESSION / 'table.yaml'
-HEAVY = {'numpy', 'scipy', 'yaml', 'rosbags', 'rclpy', 'matplotlib', 'jinja2', 'rich', 'ament_index_python', 'sensor_msgs'}
+HEAVY = {'numpy', 'scipy', 'yaml', 'rosbags', 'rclpy', 'matplotlib', 'jinja2', 'tqdm', 'ament_index_python', 'sensor_msgs'}
 
 
 @pytest.fixture(scope='module')
@@ -57,7 +57,7 @@ def test_the_package_alone_imports_nothing_heavy():
 
 @pytest.mark.live
 def test_its_functions_come_without_ros_and_without_a_screen():
-    assert not modules_after('import imu_calibration as imu; imu.calibrate, imu.load') & {'rclpy', 'rosbags', 'matplotlib', 'rich', 'sensor_msgs'}
+    assert not modules_after('import imu_calibration as imu; imu.calibrate, imu.load') & {'rclpy', 'rosbags', 'matplotlib', 'tqdm', 'sensor_msgs'}
 
 
 def test_the_names_are_those_that_a_type_checker_sees():

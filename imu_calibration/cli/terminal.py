@@ -1,0 +1,99 @@
+"""Text on standard output: lines break between words at the width of a terminal, with colours where they are wanted; a file has neither."""
+
+import os
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import TextIO
+
+UNLIMITED = 10_000
+"""Width of a line in a file."""
+CODES = {'bold': '1', 'dim': '2', 'green': '32', 'yellow': '33', 'cyan': '36', 'bold red': '1;31'}
+"""Style -> code of its escape sequence (ECMA-48, select graphic rendition)."""
+STYLES = {'refuse': 'bold red', 'warning': 'yellow', 'note': 'cyan', 'good': 'green'}
+"""Severity of a finding or level of a status -> style."""
+Cell = str | tuple[str, str]
+"""Text, or (text, style of `CODES` or '')."""
+
+
+@dataclass(frozen=True)
+class Terminal:
+    """A stream of text with a width."""
+
+    stream: TextIO
+    """Where lines are written."""
+    width: int
+    """Characters of a line."""
+    moves: bool = False
+    """Whether the cursor can move: a terminal."""
+    coloured: bool = False
+    """Whether escape sequences of colours are written."""
+
+    @classmethod
+    def standard(cls) -> 'Terminal':
+        """Return that of standard output: colours on a terminal unless NO_COLOR is set (no-color.org)."""
+        moves = sys.stdout.isatty()
+        coloured = moves and not os.environ.get('NO_COLOR') and os.environ.get('TERM') != 'dumb'
+        return cls(sys.stdout, shutil.get_terminal_size().columns if moves else UNLIMITED, moves, coloured)
+
+    def styled(self, text: str, style: str) -> str:
+        """Return the text in a style of `CODES`; '' is plain."""
+        return f'\x1b[{CODES[style]}m{text}\x1b[0m' if self.coloured and style and text else text
+
+    def print(self, text: str = '', style: str = '') -> None:
+        """Print the lines of a text."""
+        self.write(self.styled(part, style) for line in text.splitlines() or [''] for part in _wrapped(line, self.width))
+
+    def write(self, lines: Iterable[str]) -> None:
+        """Print lines as they are."""
+        for line in lines:
+            print(line, file=self.stream)
+
+    def redraw(self, lines: Sequence[str], drawn: int) -> int:
+        """Replace the last `drawn` lines; return the number of lines that can be replaced next."""
+        if not self.moves:
+            return 0
+        self.stream.write(f'\x1b[{drawn}A\x1b[J' * bool(drawn))
+        self.write(lines)
+        self.stream.flush()
+        return len(lines)
+
+    def table(self, rows: Sequence[Sequence[Cell]], *, widths: Sequence[int] = (), right: Sequence[int] = (), gap: int = 2) -> list[str]:
+        """
+        Return the lines of a table without rules.
+
+        Parameters
+        ----------
+        rows : sequence of sequences of Cell
+        widths : sequence of int, optional
+            Characters of each column; the default is its longest cell, and for the last column the remaining width at most.
+        right : sequence of int
+            Columns that are flush right.
+        gap : int
+            Spaces between columns.
+
+        """
+        cells = [[cell if isinstance(cell, tuple) else (cell, '') for cell in row] for row in rows]
+        if not widths:
+            widths = [max(len(text) for text, _ in column) for column in zip(*cells, strict=True)]
+            room = max(self.width - sum(widths[:-1]) - gap * (len(widths) - 1), 1)
+            widths = [*widths[:-1], min(widths[-1], room)]
+        lines = []
+        for row in cells:
+            for parts in zip_longest(*(_wrapped(text, width) for (text, _), width in zip(row, widths, strict=True)), fillvalue=''):
+                padded = [part.rjust(width) if k in right else part.ljust(width) for k, (part, width) in enumerate(zip(parts, widths))]
+                last = len(padded) - 1
+                padded[last] = padded[last].rstrip()
+                lines.append((' ' * gap).join(self.styled(part, style) for part, (_, style) in zip(padded, row)).rstrip())
+        return lines
+
+
+def _wrapped(text, width):
+    """Return the lines of one line of text, broken between words; further lines have its indentation."""
+    if len(text) <= width:
+        return [text]
+    indent = ' ' * (len(text) - len(text.lstrip()))
+    return textwrap.wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
