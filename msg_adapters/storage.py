@@ -47,7 +47,12 @@ class RawMessages(NamedTuple):
 
 
 class StorageFile:
-    """Base of the readers: they provide `topic_ids` (topic -> numbers), `_stretches` and `unpack`, and count in `lost`."""
+    """
+    Base of the readers of one file.
+
+    They provide `topic_ids` (topic -> numbers), `_stretches` and `unpack`, count in `lost`, and have `types`, `definitions`, `count`,
+    `time_range` and `close`. Writers have `add_topic`, `write`, `close` (finishes the file) and `abort`.
+    """
 
     topic_ids: dict[str, list[int]]
     """Topic -> the file's own numbers of it."""

@@ -8,6 +8,7 @@ are common when the table is not level and independent when an encoder is read i
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -47,10 +48,6 @@ MOVING_SAMPLES = 20_000
 """Most samples of moving windows that are used; they are subsampled evenly beyond it."""
 
 
-
-
-
-
 def error_budget(result: 'TableResult') -> ErrorBudget:
     """
     Return the ErrorBudget of a calibration on a table.
@@ -82,46 +79,30 @@ def _causes(result, gravity_sd):
     found = []
     if result.solution.model.find('reference', Role.TILT) is None:
         text = f'levelling {LEVELLING_SD / ARCMIN:.2g} arcmin in each direction, not estimated'
-        found.append(('levelling', text, False, [_Tilted(LEVELLING_SD * np.eye(2)[k]) for k in range(2)]))
+        found.append(('levelling', text, False, [partial(_tilted, angles) for angles in LEVELLING_SD * np.eye(2)]))
     text = f'joint positions {JOINT_POSITION_SD / ARCMIN * 60:.2g} arcsec, independent in every window'
-    found.append(('joint position', text, True, [_Turned(JOINT_POSITION_SD, k) for k in range(len(result.table.joints))]))
-    found.append(('table rate', f'rate wrong by {TABLE_RATE_SD:.2g} of itself in all windows', False, [_Faster(TABLE_RATE_SD)]))
-    found.append(('gravity', f'gravity known to {gravity_sd:.2g} m/s²', False, [_Heavier(gravity_sd)]))
+    turns = JOINT_POSITION_SD * np.eye(len(result.table.joints))
+    found.append(('joint position', text, True, [partial(_turned, angles) for angles in turns]))
+    text = f'rate wrong by {TABLE_RATE_SD:.2g} of itself in all windows'
+    found.append(('table rate', text, False, [partial(_faster, 1 + TABLE_RATE_SD)]))
+    found.append(('gravity', f'gravity known to {gravity_sd:.2g} m/s²', False, [partial(_heavier, gravity_sd)]))
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class _Tilted:
-    angles: np.ndarray
-
-    def __call__(self, table, motion):
-        return tilt(table, self.angles), motion
+def _tilted(angles, table, motion):
+    return tilt(table, angles), motion
 
 
-@dataclass(frozen=True)
-class _Turned:
-    angle: float
-    joint: int
-
-    def __call__(self, table, motion):
-        return table, replace(motion, position=motion.position + self.angle * np.eye(motion.position.shape[1])[self.joint])
+def _turned(angles, table, motion):
+    return table, replace(motion, position=motion.position + angles)
 
 
-@dataclass(frozen=True)
-class _Faster:
-    share: float
-
-    def __call__(self, table, motion):
-        factor = 1 + self.share
-        return table, replace(motion, rate=factor * motion.rate, acceleration=factor**2 * motion.acceleration)
+def _faster(factor, table, motion):
+    return table, replace(motion, rate=factor * motion.rate, acceleration=factor**2 * motion.acceleration)
 
 
-@dataclass(frozen=True)
-class _Heavier:
-    change: float
-
-    def __call__(self, table, motion):
-        return replace(table, gravity=table.gravity_value + self.change), motion
+def _heavier(change, table, motion):
+    return replace(table, gravity=table.gravity_value + change), motion
 
 
 def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.ndarray:

@@ -15,7 +15,7 @@ from imu_calibration.document.decision import SensorDecision, Verdict, decide, d
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.covariance_terms import GRAVITY
-from imu_calibration.estimation.solution import COMMON_SCALE, FIXED, HELD, LACKING, Status
+from imu_calibration.estimation.solution import COMMON_SCALE, FIXED, HELD, Status
 
 UNKNOWN = 'unknown'
 """Entry of the provenance for the uncertainty of imported values."""
@@ -139,9 +139,6 @@ class Calibration:
         nuisances = set(np.array(self.param_names)[~self.model.requested])
         return {name: status for name, status in self.status_by_name.items() if name not in nuisances and status != FIXED}
 
-    def all_determined(self) -> bool:
-        """Return whether every parameter is determined."""
-        return not set(LACKING) & set(self.status_by_name.values())
 
     def compensate(self, samples: ImuSamples | np.ndarray, rate_s: np.ndarray | None = None, *, time: np.ndarray | None = None,
                    temperature_c: Any = None) -> ImuSamples | tuple[np.ndarray, np.ndarray]:

@@ -23,7 +23,6 @@ from imu_calibration.calibration.session import LiveByHandSettings, LiveSession,
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
-from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.nodes.calibration_status import CalibrationGuide, markers_of, statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker
 from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
@@ -35,9 +34,8 @@ from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of, words_of
 from imu_calibration.nodes.session_files import SessionFiles, reference_of
 from imu_calibration.preprocessing.window import WindowSettings
-from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.provenance import provenance_with
-from imu_calibration.use_cases.resources import config_file
 from msg_adapters.live import LiveGatherer
 from msg_adapters.write import encode_imu, rows
 
@@ -105,7 +103,8 @@ class CalibrationNode(Node):
         super().__init__('calibration_node', **options)
         self.settings = declare_parameters(self, CalibrationNodeSettings, self._change_files, hints=HINTS['calibration_node'])
         self._live_settings = declare_parameters(self, LiveSettings, self._change_live)
-        self._options = self._read_options(declare_parameters(self, WindowSettings, self._change_windows))
+        windows = declare_parameters(self, WindowSettings, self._change_windows)
+        self._options = replace(calibration_options({name: chosen or None for name, chosen in self._choices().items()}), windows=windows)
         self._hand_settings = declare_parameters(self, LiveByHandSettings, self._change_by_hand)
         robot = declare_parameters(self, RobotSettings)
         joints = [] if not robot.urdf_file and self.settings.table_file in NO_TABLE else ['joint_states']
@@ -144,21 +143,15 @@ class CalibrationNode(Node):
         """End the worker after its present step; return the outcome for unsaved motion."""
         return self.worker.end()
 
-    def _read_options(self, windows: WindowSettings) -> CalibrationOptions:
+    def _choices(self) -> dict[str, Any]:
+        """Return the choices that the document names."""
         settings = self.settings
-        catalogue = files.read_effects(files.user_path(settings.effects_file)) if settings.effects_file else CATALOGUE
-        place = files.user_path(settings.tolerances_file) if settings.tolerances_file else config_file('tolerances.yaml')
-        return CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None, settings.reference_model or None,
-                                  files.read_tolerances(place, catalogue), windows, catalogue=catalogue,
-                                  noise=files.read_noise(files.user_path(settings.noise_file)) if settings.noise_file else None,
-                                  as_asked=settings.model_as_asked)
+        paths = {'tolerances': settings.tolerances_file, 'catalogue': settings.effects_file, 'noise': settings.noise_file}
+        return {name: getattr(settings, name) for name in DOCUMENTED} | {k: files.user_path(path) for k, path in paths.items() if path}
 
     def _provenance(self, robot: RobotSettings) -> dict[str, Any]:
-        choices: dict[str, Any] = {name: getattr(self.settings, name) for name in DOCUMENTED}
-        paths = {'tolerances': self.settings.tolerances_file, 'catalogue': self.settings.effects_file, 'noise': self.settings.noise_file}
-        choices |= {name: files.user_path(path) for name, path in paths.items() if path}
         stand = robot.urdf_file or self.settings.table_file
-        return provenance_with('calibration_node', (), choices, stand=None if stand in NO_TABLE else files.user_path(stand))
+        return provenance_with('calibration_node', (), self._choices(), stand=None if stand in NO_TABLE else files.user_path(stand))
 
     def _make_live(self, saved: bytes | None = None) -> LiveSession:
         return self._reference.begin(self._options, self._live_settings, self._hand_settings, saved)

@@ -38,6 +38,7 @@ class TopicCommand:
         """Action of the same controller, by the convention of ros2_control."""
         self.goals: set[bytes] = set()
         """Goals of this node; none."""
+        encode_trajectory(TrajectoryPoints.stop(()))   # loads the message types, so that no stop waits for them
 
     @property
     def is_heard(self) -> bool:

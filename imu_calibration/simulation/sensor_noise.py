@@ -43,9 +43,6 @@ class SimulatedNoise:
     encoder_resolution: float = 0.0
     """Step of the joint positions, rad; 0: continuous."""
 
-    def white_only(self) -> 'SimulatedNoise':
-        """Return the model with only the white noise of the IMU."""
-        return SimulatedNoise(accel_density=self.accel_density, gyro_density=self.gyro_density)
 
 
 @dataclass(frozen=True)

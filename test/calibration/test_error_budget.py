@@ -1,13 +1,14 @@
 """The error budget: what it predicts is what happens when the same recording is calibrated against a wrong reference."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.table_calibration import calibrate
-from imu_calibration.calibration.table_result import JOINT_POSITION_SD, _Faster, _Heavier, _Tilted, _Turned, error_budget, parameter_shifts
+from imu_calibration.calibration.table_result import JOINT_POSITION_SD, _faster, _heavier, _tilted, _turned, error_budget, parameter_shifts
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solver import solve
@@ -55,7 +56,7 @@ def moved(recording, result, false_table):
 @pytest.mark.parametrize('axis', (0, 1))
 def test_a_table_that_is_not_level_moves_the_parameters_as_predicted(recording, result, axis):
     angle = 1e-3 * np.eye(2)[axis]
-    shift = parameter_shifts(result, [_Tilted(angle)])[0].sum(axis=0)
+    shift = parameter_shifts(result, [partial(_tilted, angle)])[0].sum(axis=0)
     actual = -moved(recording, result, tilt(result.table, angle))
     assert np.linalg.norm(shift[:12]) > 1e-4
     for effect in result.solution.model.effects[:3]:
@@ -64,14 +65,14 @@ def test_a_table_that_is_not_level_moves_the_parameters_as_predicted(recording, 
 
 
 def test_a_wrong_gravity_scales_the_accelerometer_matrix(recording, result):
-    shift = parameter_shifts(result, [_Heavier(0.01)])[0].sum(axis=0)
+    shift = parameter_shifts(result, [partial(_heavier, 0.01)])[0].sum(axis=0)
     assert shift[3:12] == pytest.approx(result.solution.values[3:12] * 0.01 / 9.81, abs=3e-7)
     actual = -moved(recording, result, replace(result.table, gravity=9.82))
     assert actual[:21] == pytest.approx(shift[:21], abs=5e-6)
 
 
 def test_a_fast_table_clock_scales_the_gyroscope_matrix_and_the_arms(result):
-    shift = parameter_shifts(result, [_Faster(1e-3)])[0].sum(axis=0)
+    shift = parameter_shifts(result, [partial(_faster, 1 + 1e-3)])[0].sum(axis=0)
     names = result.solution.param_names
     arms, matrix = (result.solution.model.slices[key] for key in (('accelerometer', 'accel_size_effect'), ('gyroscope', 'matrix')))
     assert names[matrix.start] == 'gyroscope.matrix.xx'
@@ -82,7 +83,7 @@ def test_a_fast_table_clock_scales_the_gyroscope_matrix_and_the_arms(result):
 def test_joint_errors_are_drawn_anew_in_every_window(result):
     """The sd of the budget is that of random joint errors put through the same shifts."""
     budget = error_budget(result)
-    changes = [_Turned(1.0 * JOINT_POSITION_SD, k) for k in range(3)]
+    changes = [partial(_turned, angles) for angles in JOINT_POSITION_SD * np.eye(3)]
     shifts = parameter_shifts(result, changes)
     rng = np.random.default_rng(5)
     draws = np.einsum('dkw,kwp->dp', rng.normal(size=(4000, *shifts.shape[:2])), shifts)

@@ -169,7 +169,7 @@ def write_bag(session, path, **options):
 def _noise_model(noise, grade, encoder_resolution):
     if isinstance(noise, str):
         full = realistic(grade)
-        quiet = replace(full.white_only(), encoder_noise=2e-6)
+        quiet = SimulatedNoise(accel_density=full.accel_density, gyro_density=full.gyro_density, encoder_noise=2e-6)
         real = replace(full, encoder_noise=2e-6)
         still = replace(real, accel_instability=0.0, gyro_instability=0.0)
         noise = {'none': SimulatedNoise(), 'white': quiet, 'realistic': real, **dict.fromkeys(WANDERS, still)}[noise]
