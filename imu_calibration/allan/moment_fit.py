@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations
 
 import numpy as np
@@ -255,29 +255,31 @@ def coefficient_interval(moments: Moments, fits: Sequence[MomentFit], weights: S
 
     """
     first, index = fits[0], fits[0].names.index(name)
-    scored, tail = _Average([_ScoreOfCoefficient(moments, fit, excess, fit.names.index(name)) for fit in fits], weights), TAIL
+    members = [_ScoreOfCoefficient(moments, fit, excess, fit.names.index(name)) for fit in fits]
+    tails = partial(_averaged, members, np.asarray(weights, float) / np.sum(weights))
     limit = float(np.min(moments.target / moments.design((first.processes[index],))[:, 0]))
     middle = max(first.coefficients[index], 1e-3 * limit)
-    step = min(scored.members[0].relative_sd(), 1.5)
+    step = min(members[0].relative_sd(), 1.5)
     lower = 0.0
     alone = not np.any(np.delete(first.coefficients, index))
-    if first.coefficients[index] > 0 and (alone or scored.tail_above(0.0) < tail):
-        lower = _crossing(lambda value: scored.tail_above(value) - tail, middle, -step)
-    return lower, _crossing(lambda value: scored.tail_below(value) - tail, middle, step)
+    if first.coefficients[index] > 0 and (alone or tails(0.0)[0] < TAIL):
+        lower = _crossing(lambda value: tails(value)[0] - TAIL, middle, -step)
+    return lower, _crossing(lambda value: tails(value)[1] - TAIL, middle, step)
 
 
 def score_at_zero(moments: Moments, fit: MomentFit, index: int) -> float:
     """Return the p-value of process `index`: the null hypothesis is a coefficient of zero."""
-    return _ScoreOfCoefficient(moments, fit, 1.0, index).tail_above(0.0)
+    return _ScoreOfCoefficient(moments, fit, 1.0, index).tails(0.0)[0]
 
 
 def time_interval(moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], *, excess: float = 1.0) -> tuple[float, float]:
     """Return the interval of the time of models whose last process is Gauss-Markov, s; infinite where a random walk fits as well."""
     times = moments.times
     best = int(np.argmin(np.abs(np.log(times / fits[0].processes[-1].time))))
-    scored, tail = _Average([_ScoreOfTime(moments, fit, excess) for fit in fits], weights), TAIL
-    upper = _first(times[best + 1:], lambda time: scored.tail_below(time) < tail)
-    lower = _first(times[:best][::-1], lambda time: scored.tail_above(time) < tail)
+    members = [_ScoreOfTime(moments, fit, excess) for fit in fits]
+    tails = partial(_averaged, members, np.asarray(weights, float) / np.sum(weights))
+    upper = _first(times[best + 1:], lambda time: tails(time)[1] < TAIL)
+    lower = _first(times[:best][::-1], lambda time: tails(time)[0] < TAIL)
     return 0.0 if lower is None else lower, np.inf if upper is None else upper
 
 
@@ -296,19 +298,9 @@ def _first(values, refused):
     return float(values[far])
 
 
-class _Average:
-    """Tails averaged over models."""
-
-    def __init__(self, members, weights):
-        self.members, self._weights = members, np.asarray(weights, float) / np.sum(weights)
-
-    def tail_above(self, value):
-        """Return the probability of a larger misfit."""
-        return sum(weight * member.tail_above(value) for weight, member in zip(self._weights, self.members))
-
-    def tail_below(self, value):
-        """Return the probability of a smaller one."""
-        return sum(weight * member.tail_below(value) for weight, member in zip(self._weights, self.members))
+def _averaged(members, weights, value):
+    """Return the `tails` of several models at `value`, averaged with weights of sum 1, shape (2,)."""
+    return weights @ [member.tails(value) for member in members]
 
 
 class _Score:
@@ -317,15 +309,8 @@ class _Score:
     def __init__(self, moments, fit, excess):
         self.moments, self.fit, self._excess, self._tails = moments, fit, excess, {}
 
-    def tail_above(self, value):
-        """Return the probability of a larger misfit than observed, if `value` is true."""
-        return self._evaluate(value)[0]
-
-    def tail_below(self, value):
-        """Return the probability of a smaller one."""
-        return self._evaluate(value)[1]
-
-    def _evaluate(self, value):
+    def tails(self, value):
+        """Return the probabilities of a larger and of a smaller misfit than observed, if `value` is true."""
         if value not in self._tails:
             fit, direction, others = self.at(value)
             self._tails[value] = _tails(self.moments, fit, direction, others, self._excess)
