@@ -77,7 +77,7 @@ class HandResult(CalibrationResult):
         true, zero = hand.gravity * hand.state.up, np.zeros_like(rate)
         corrected_force, corrected_rate = hand.compensate(force, rate, poses.time, temperature_c=poses.temperature_c)
         for out, values in held_out_values(hand, hand.used_turns):
-            corrected = hand.hand_model.compensate(values, force, rate, time=poses.time, temperature_c=poses.temperature_c)
+            corrected = hand.hand_model.compensate(values, force, rate, **poses.conditions)
             corrected_force[out], corrected_rate[out] = (part[out] for part in corrected)
         samples = max(int(poses.stop[-1]), 1)
         time = (poses.start + poses.stop) / 2 * self.gathered.duration / max(samples - 1, 1)

@@ -130,6 +130,11 @@ def read_calibration(path: str | PathLike[str]) -> Calibration:
     return calibration_from_text(read_text(path, 'calibration'))
 
 
+def given_calibration(chosen: Calibration | str | PathLike[str]) -> Calibration:
+    """Return the calibration, read where it is a file."""
+    return read_calibration(chosen) if isinstance(chosen, (str, PathLike)) else chosen
+
+
 def read_noise(path: str | os.PathLike) -> NoiseFigures:
     """Return the noise in a file that the verb `noise` wrote; an error names the file."""
     try:

@@ -108,7 +108,7 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
     check_names(choices)
     options, topics = calibration_options(choices), topics_of(choices)
     given = {**choices, 'earlier': earlier}
-    earlier = files.read_calibration(earlier) if isinstance(earlier, (str, PathLike)) else earlier
+    earlier = None if earlier is None else files.given_calibration(earlier)
     if earlier is not None and table is None:
         raise InputError('an earlier calibration must be compared on a table, none was given; give its description', key='table',
                          code='table_missing')

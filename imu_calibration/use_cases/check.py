@@ -38,7 +38,7 @@ def check(recording: str | PathLike | SampleBlock, calibration: Calibration | st
 
     """
     check_names(choices)
-    calibration = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    calibration = files.given_calibration(calibration)
     options, topics = calibration_options(choices), topics_of(choices)
     if table is None:
         result = check_by_hand(source_of(recording, topics, want_joints=False), calibration, options)

@@ -84,7 +84,7 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
         the output exists.
 
     """
-    calibration = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    calibration = files.given_calibration(calibration)
     used = usable(calibration, anyway=anyway)
     calibration, figures = used.calibration, noise_of(noise)
     calibration = calibration if figures is None else with_measured_noise(calibration, figures)

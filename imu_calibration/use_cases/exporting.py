@@ -49,7 +49,7 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
 
     """
     target = find_target(to)
-    known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    known = files.given_calibration(calibration)
     figures = None if noise is None else files.read_noise(noise)
     motion = None if bag is None else _motion(known, bag, stand, topics)
     found = export(known, target, noise=figures, rate=rate, motion=motion, anyway=anyway)

@@ -146,7 +146,7 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
                          'measures the turns)', key='table', code='replay_by_hand')
     topics = topics_of(choices)
     given = table_of(table, [recording], topics, gravity=choices.get('gravity'))
-    known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    known = files.given_calibration(calibration)
     _require_joints(known, given)
     noise = None
     if all('noise_sd' in known.statistics.get(sensor, {}) for sensor in SENSORS):
@@ -164,7 +164,7 @@ def _truth(table, calibration, grade, seed, catalogue):
     if calibration is None:
         model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names, catalogue=catalogue)
         return model, random_values(model, grade, seed)
-    known = files.read_calibration(calibration) if isinstance(calibration, (str, PathLike)) else calibration
+    known = files.given_calibration(calibration)
     _require_joints(known, table)
     return known.model, known.values
 

@@ -78,8 +78,7 @@ def _with_residuals(hand):
 def _rates_left(hand):
     """Return the residual rates at rest, shape (k, 3)."""
     poses, true = hand.poses, hand.gravity * hand.state.up
-    more = hand.hand_model.further('gyroscope', hand.values, true, rate=np.zeros_like(true), time=poses.time,
-                              temperature_c=poses.temperature_c)[0]
+    more = hand.hand_model.further('gyroscope', hand.values, true, **poses.conditions)[0]
     return poses.rate - hand.gyroscope[0] - more
 
 

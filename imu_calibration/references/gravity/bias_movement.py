@@ -37,9 +37,9 @@ def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[s
     if not np.ptp(poses.time) > 0:
         return {}
     time = (poses.time - poses.time.mean()) / np.ptp(poses.time)
-    residual, columns = model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
-    true = model.compensate(values, poses.force, np.zeros_like(poses.force), time=poses.time, temperature_c=poses.temperature_c)[0]
-    more = model.further('gyroscope', values, true, rate=np.zeros_like(true), time=poses.time, temperature_c=poses.temperature_c)[0]
+    residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
+    true = model.compensate(values, poses.force, np.zeros_like(poses.force), **poses.conditions)[0]
+    more = model.further('gyroscope', values, true, **poses.conditions)[0]
     turning = (poses.rate - values[model.gyro_bias] - more)
     base = columns[:, model.base_index('accelerometer')]
     found = {'accelerometer': _of_norms(time, residual, base), 'gyroscope': _of_rates(time, turning)}

@@ -115,7 +115,7 @@ def _natural(poses, sensor):
 def _norm_block(hand, space, at_rest, sensor_of):
     """One row per pose: ``|true force| - gravity``."""
     poses, count = hand.poses, len(hand.poses.start)
-    residual, base = hand.hand_model.norm_rows(hand.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
+    residual, base = hand.hand_model.norm_rows(hand.values, poses.force, **poses.conditions)
     back = base[:, 0:3]
     rows = np.zeros((count, space.size + 1))
     rows[:, :base.shape[1]], rows[:, -1] = base, residual
@@ -131,8 +131,7 @@ def _rest_block(hand, space, at_rest, sensor_of):
     """Three rows per pose: the rate at rest, with the Earth's rate about the vertical."""
     poses, count = hand.poses, len(hand.poses.start)
     true = hand.gravity * hand.state.up
-    more, slopes = hand.hand_model.further('gyroscope', hand.values, true, rate=np.zeros_like(true), time=poses.time,
-                                      temperature_c=poses.temperature_c)
+    more, slopes = hand.hand_model.further('gyroscope', hand.values, true, **poses.conditions)
     rows = np.zeros((count, 3, space.size + 1))
     rows[:, :, hand.hand_model.gyro_bias] = np.eye(3)
     rows[:, :, hand.hand_model.size] = hand.state.up

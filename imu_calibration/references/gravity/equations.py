@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,11 @@ class Poses:
     """Time from sample to sample, s."""
     half_turn: np.ndarray | None = None
     """Angle by which the attitude creeps across gravity from the middle of each interval to its end, rad, shape (k, 3); not in `rate`."""
+
+    @property
+    def conditions(self) -> dict[str, Any]:
+        """Time and temperature, as the functions of `HandModel` take them."""
+        return {'time': self.time, 'temperature_c': self.temperature_c}
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +140,7 @@ def _pose_rows(model, state, poses, across):
     bias, matrix, *_ = model.linear(state.values)
     count = len(state.up)
     true = model.gravity * state.up
-    more, slopes = model.further('accelerometer', state.values, true, rate=np.zeros_like(true), time=poses.time,
-                                 temperature_c=poses.temperature_c)
+    more, slopes = model.further('accelerometer', state.values, true, **poses.conditions)
     main = np.zeros((count, 3, model.size))
     main[:, :, 0:3] = np.eye(3)
     for i in range(3):
@@ -152,8 +157,7 @@ def _drift_rows(model, state, poses):
     """``rate = bias + further effects (gravity * up) + drift`` at rest."""
     count = len(state.up)
     true = model.gravity * state.up
-    more, slopes = model.further('gyroscope', state.values, true, rate=np.zeros_like(true), time=poses.time,
-                                 temperature_c=poses.temperature_c)
+    more, slopes = model.further('gyroscope', state.values, true, **poses.conditions)
     main = np.zeros((count, 3, model.size))
     main[:, :, model.gyro_bias] = np.eye(3)
     main[:, :, model.extra_index('gyroscope')] = slopes

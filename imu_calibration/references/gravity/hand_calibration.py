@@ -103,7 +103,7 @@ class HandCalibration(Solution):
     def norm_residuals(self) -> np.ndarray:
         """Return ``|compensated force| - gravity`` of the poses, shape (k,)."""
         poses = self.poses
-        return self.hand_model.norm_rows(self.values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0]
+        return self.hand_model.norm_rows(self.values, poses.force, **poses.conditions)[0]
 
 
 def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), stills: Sequence | None = None, *,
@@ -246,7 +246,7 @@ def default_gyroscope(poses: Poses) -> tuple[tuple[str, ...], dict]:
 
 
 def _statistics(model, found, poses, turns):
-    before, after = (model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)[0]
+    before, after = (model.norm_rows(values, poses.force, **poses.conditions)[0]
                      for values in (model.nominal, found.state.values))
     sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
     of_accelerometer = np.char.startswith(model.model.param_names, 'accelerometer')

@@ -114,15 +114,15 @@ class HandModel:
         """Return the same model with the columns of warm-ups computed at `values`."""
         return replace(self, model=self.model.at(values))
 
-    def further(self, sensor: str, values: np.ndarray, force: np.ndarray, *, rate: np.ndarray, time: np.ndarray | None = None,
-                temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def further(self, sensor: str, values: np.ndarray, force: np.ndarray, *, rate: np.ndarray | None = None,
+                time: np.ndarray | None = None, temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """
         Return the contribution of the further effects to the output of a sensor, and its derivative by their parameters.
 
         Parameters
         ----------
         force, rate : arrays, shape (m, 3)
-            True specific force and rate.
+            True specific force and rate; default: at rest.
         time : array, optional
             Seconds since the first sample, shape (m,).
         temperature_c : array, optional
@@ -138,7 +138,7 @@ class HandModel:
         output, columns = np.zeros((len(force), 3)), [np.zeros((len(force), 3, 0))]
         if not effects:
             return output, columns[0]
-        ref = _reference(force, rate, time, temperature_c, self.gravity)
+        ref = _reference(force, np.zeros_like(force) if rate is None else rate, time, temperature_c, self.gravity)
         point, own = self.model.full_point(), self.model.values_of(sensor, values)
         for effect in effects:
             basis = {group.name: group.columns(ref, point) for group in effect.groups}
@@ -178,7 +178,7 @@ class HandModel:
         columns = np.zeros((len(force), self.size))
         columns[:, 0:3] = back
         columns[:, 3:12] = (back[:, :, None] * np.tril(true[:, None].repeat(3, axis=1))).reshape(-1, 9)
-        slopes = self.further('accelerometer', values, true, rate=np.zeros_like(true), time=time, temperature_c=temperature_c)[1]
+        slopes = self.further('accelerometer', values, true, time=time, temperature_c=temperature_c)[1]
         columns[:, self.extra_index('accelerometer')] = np.einsum('ki,kip->kp', back, slopes)
         return norm - self.gravity, columns
 

@@ -58,7 +58,7 @@ def first_state(model: HandModel, poses: Poses) -> State:
     values, nominal, priors, gravity = model.nominal.copy(), model.nominal, model.priors, model.gravity
     own = model.base_index('accelerometer')
     for _ in range(ITERATIONS):
-        residual, columns = model.norm_rows(values, poses.force, time=poses.time, temperature_c=poses.temperature_c)
+        residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
         rows = np.vstack([columns[:, own] / (1e-3 * gravity), np.diag(1 / priors[own])])
         target = np.concatenate([residual / (1e-3 * gravity), (nominal - values)[own] / priors[own]])
         step = np.linalg.lstsq(rows, target, rcond=None)[0]
@@ -80,8 +80,7 @@ def _of_gravity(model, values, relative_sd):
 
 def _of_earth(model, state, poses, free):
     """Return the contribution of the Earth's rate about the vertical to the covariance, through biases and responses to gravity."""
-    slopes = model.further('gyroscope', state.values, model.gravity * state.up, rate=np.zeros_like(state.up), time=poses.time,
-                           temperature_c=poses.temperature_c)[1]
+    slopes = model.further('gyroscope', state.values, model.gravity * state.up, **poses.conditions)[1]
     own = np.concatenate([np.arange(model.size)[model.gyro_bias], model.extra_index('gyroscope')])
     columns = np.concatenate([np.broadcast_to(np.eye(3), (len(slopes), 3, 3)), slopes], axis=2).reshape(-1, len(own))
     taken, kept = np.zeros(model.size), own[free[own]]
