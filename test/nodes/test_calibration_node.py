@@ -32,11 +32,15 @@ RATE = 10.0
 
 @pytest.fixture(scope='module')
 def bags(tmp_path_factory):
-    """Two sessions of one IMU: one to calibrate with, and one of another motion to correct, an hour later."""
+    """Two sessions of one IMU: one to calibrate with, also in two parts, and one of another motion to correct, an hour later."""
     folder = tmp_path_factory.mktemp('bags')
     for name, profile in (('session', 'quick'), ('drive', 'tumbling')):
         imu, joints, values, model = make_session(3, profile=profile)
         write_session(folder / name, imu, joints)
+        if name == 'session':
+            cut = imu.stamp_ns[len(imu) * 4 // 5]
+            write_session(folder / 'beginning', *(samples.select(samples.stamp_ns < cut) for samples in (imu, joints)))
+            write_session(folder / 'ending', *(samples.select(samples.stamp_ns >= cut) for samples in (imu, joints)))
     return folder
 
 
@@ -47,8 +51,9 @@ def test_a_bag_through_both_nodes(bags, tmp_path):
         station.watch_diagnostics()
         station.calibration_node(tmp_path, resume=True)
         compensator = station.start('compensator_node')
-        player = station.play(bags / 'session', RATE, subscribers=1)
-        station.until(lambda: player.poll() is not None, 'the end of the recording')
+        for part in ('beginning', 'ending'):
+            player = station.play(bags / part, RATE, subscribers=1)
+            station.until(lambda: player.poll() is not None and documents, 'the end of the part and a calibration, which the residuals need')
         answer = station.call('/calibration_node/save')
         assert answer.success, answer.message
         live = calibration_from_text((tmp_path / 'calibration.yaml').read_text())
