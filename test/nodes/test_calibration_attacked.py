@@ -17,6 +17,7 @@ from sensor_msgs.msg import Imu, JointState  # noqa: E402
 
 from imu_calibration.nodes import calibration_node  # noqa: E402
 from imu_calibration.nodes.calibration_node import CalibrationNode  # noqa: E402
+from imu_calibration.nodes.calibration_status import advice_of  # noqa: E402
 from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
 
 from ros.live_station import TABLE  # noqa: E402
@@ -64,7 +65,7 @@ def gathered(bench, node):
 
 def test_a_session_is_told_line_by_line_each_once(bench, session, tmp_path):
     node = start(bench, tmp_path)
-    bench.until(lambda: bench.heard('next: ', level='info'), 'what is missing next')
+    bench.until(lambda: (advice := advice_of(node.worker.state)) and bench.heard(advice, level='info'), 'what is missing next')
     send(bench, *session)
     gathered(bench, node)
     answer = bench.call('/calibration_node/solve')
