@@ -9,6 +9,7 @@ import yaml
 from refusal import refused
 from scipy.signal import lfilter
 
+from imu_calibration.allan import identify
 from imu_calibration.allan.document import exit_code, filter_lines, lines, noise_from_text, noise_to_text
 from imu_calibration.allan.identify import figures_of, identify_noise, read_rest
 from imu_calibration.allan.processes import RANDOM_WALK
@@ -64,6 +65,17 @@ def quiet():
     return imu, identify_noise(source(imu))
 
 
+@pytest.fixture
+def accelerometer_x_only(quiet, monkeypatch):
+    """Identify the first axis only: the others have the noise of the quiet record."""
+    others = []
+
+    def identified(moments):
+        others[:] = others or [*reversed(quiet[1].axes[1:]), None]
+        return others.pop() or identify_axis(moments)
+    monkeypatch.setattr(identify, 'identify_axis', identified)
+
+
 def test_rest_is_used_whole_and_nothing_is_taken_out(quiet):
     found = quiet[1].record
     assert len(found.parts) == 1 and found.curve.seconds == pytest.approx(1200.0, abs=1.0)
@@ -115,7 +127,7 @@ def warming(imu, per_kelvin, seed=3):
     return changed(imu, 0, 0, per_kelvin * (warmth - 30.0)), TemperatureSamples(stamps, noisy)
 
 
-def test_the_temperature_is_taken_out_and_said(quiet):
+def test_the_temperature_is_taken_out_and_said(quiet, accelerometer_x_only):
     imu, before = quiet
     warm, temperature = warming(imu, 5e-3)
     found = identify_noise(source(warm, temperature))
@@ -280,7 +292,7 @@ def hummed(extra, seed, period=0.05, n=24_000):
     return ImuSamples(np.arange(n, dtype=np.int64) * round(period * 1e9) + 10**18, values[:, :3], values[:, 3:], 'imu_link')
 
 
-def test_an_oscillation_needs_a_line_in_the_periodogram():
+def test_an_oscillation_needs_a_line_in_the_periodogram(accelerometer_x_only):
     """A resonance that noise excites makes the hump of a sine, and no line."""
     time = np.arange(24_000) * 0.05
     sine = hummed(1.5 * np.sin(2 * np.pi * 0.41 * time), 11)

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 def outcome(tmp_path_factory):
     """A session whose gyroscopes feel gravity, and its diagnosis."""
     folder = tmp_path_factory.mktemp('diagnosis')
-    assert main(['simulate', '--profile', 'short', '--effect', 'gyro_g_sensitivity', '--seed', '11', '--output', str(folder / 'bag')]) == 0
+    assert main(['simulate', '--profile', 'short', '--effect', 'gyro_g_sensitivity', '--seed', '11', '--imu-rate', '50', '--joint-rate', '50', '--output', str(folder / 'bag')]) == 0
     code = main(['diagnose', str(folder / 'bag'), '--table', str(folder / 'bag' / 'table.yaml'), '--output', str(folder / 'out')])
     assert code in (0, 3)
     return folder

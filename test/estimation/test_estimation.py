@@ -121,7 +121,8 @@ def test_reported_standard_deviations_match_the_scatter(session):
         normalised.append(error / solution.sd)
         errors.append(error)
         deviations.append(solution.sd)
-        bounds.append(cramer_rao(system, FULL))
+        if seed % 6 == 0:   # it depends on the values of the IMU by parts in a thousand
+            bounds.append(cramer_rao(system, FULL))
     normalised, errors, deviations = (np.array(x) for x in (normalised, errors, deviations))
     mean_square, coverage = (normalised**2).mean(), (np.abs(normalised) < 1.96).mean()
     usual = np.median(deviations, axis=0)
