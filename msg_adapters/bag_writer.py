@@ -14,6 +14,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from msg_adapters.definitions import TypeDefinition
+from msg_adapters.layout import Packed
 from msg_adapters.storages import STORAGES, identifiers
 
 ROS_DISTRO = 'jazzy'
@@ -55,8 +56,8 @@ class BagWriter:
         self.storage.add_topic(topic_id, name, definition, qos=dump_yaml(list(qos)).strip() if qos else '')
         return topic_id
 
-    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Sequence[memoryview]) -> None:
-        """Append messages in the order of the file: arrays of topic ids and receive times, and a list of byte strings."""
+    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
+        """Append messages in the order of the file: arrays of topic ids and receive times, and the messages."""
         if not len(messages):
             return
         self.storage.write(topic_ids, received_ns, messages)

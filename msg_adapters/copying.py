@@ -14,8 +14,7 @@ from msg_adapters.bag_writer import BagWriter
 from msg_adapters.decode import FrameChoice, in_order
 from msg_adapters.definitions import is_standard, standard_definition
 from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, patch_imu_group
-from msg_adapters.layout import MessageError, from_ns, group_by_layout
-from msg_adapters.write import rows
+from msg_adapters.layout import MessageError, Packed, from_ns, group_by_layout
 
 
 def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike[str], imu_topic: str, *, corrected_topic: str,
@@ -91,14 +90,12 @@ def _check(recording, corrected_topic):
 
 def _write(writer, topic_ids, raw, measured, corrected_id, patch):
     """Write one stretch, every corrected message after the measured one."""
-    messages = [raw.packed.view(k) for k in range(len(raw.packed))]
     done, corrected = patch(raw.packed.select(measured), raw.received_ns[measured]) if len(measured) else (measured, [])
     measured = measured[done]
-    order = np.argsort(np.concatenate([np.arange(len(messages)), measured]), kind='stable').tolist()
+    order = np.argsort(np.concatenate([np.arange(len(raw.packed)), measured]), kind='stable')
     topic_ids = np.concatenate([topic_ids, np.full(len(measured), corrected_id)])
     received_ns = np.concatenate([raw.received_ns, raw.received_ns[measured]])
-    messages += corrected
-    writer.write(topic_ids[order], received_ns[order], [messages[k] for k in order])
+    writer.write(topic_ids[order], received_ns[order], Packed.chain([raw.packed, *corrected]).select(order))
 
 
 class _Patch:
@@ -120,19 +117,20 @@ class _Patch:
         groups = [group for group in groups if self.choice.wants(group[0].names[0], len(group[1]))]
         if not groups:
             return np.zeros(0, dtype=int), []
-        done = np.sort(np.concatenate([index for _, index, _ in groups]))
+        found = np.concatenate([index for _, index, _ in groups])
+        order = np.argsort(found)
+        done = found[order]
         samples = in_order([(index, decode_imu(layout, group)) for layout, index, group in groups])
         corrected = self.correct(replace(samples, stamp_ns=np.where(samples.stamp_ns == 0, received_ns[done], samples.stamp_ns)))
-        messages = [None] * len(done)
+        tables = []
         for layout, index, group in groups:
             place = np.searchsorted(done, index)
             fields = self._fields(layout, group, (corrected.force[place], corrected.rate[place]), corrected.marks[place])
             table = patch_imu_group(layout, group, fields, frame_id=self.frame_id)
             if self.late_ns:
                 _set_stamps(table, layout.order, layout.stamp_ns(group) - self.late_ns)
-            for k, message in zip(place.tolist(), rows(table), strict=True):
-                messages[k] = message
-        return done, messages
+            tables.append(Packed.of_rows(table))
+        return done, [Packed.chain(tables).select(order)]
 
     def _fields(self, layout, packed, vectors, marks):
         """Return the new fields of one group: field name -> values."""

@@ -32,10 +32,18 @@ class Packed:
         start = int(self.start[index])
         return self.buffer[start:start + int(self.size[index])].tobytes()
 
-    def view(self, index: int) -> memoryview:
-        """Return one message without copying it."""
-        start = int(self.start[index])
-        return self.buffer.data[start:start + int(self.size[index])]
+    def views(self) -> list[memoryview]:
+        """Return the messages without copying them."""
+        data = self.buffer.data
+        return [data[start:end] for start, end in zip(self.start.tolist(), (self.start + self.size).tolist(), strict=True)]
+
+    def copy_to(self, target: np.ndarray, place: np.ndarray) -> None:
+        """Copy each message into the bytes `target`, from its `place` on: one gather for each size."""
+        order = np.argsort(self.size, kind='stable')
+        for some in np.split(order, np.flatnonzero(np.diff(self.size[order])) + 1):
+            if len(some) and self.size[some[0]]:
+                kind = f'V{self.size[some[0]]}'
+                overlapping(target, kind)[place[some]] = overlapping(self.buffer, kind)[self.start[some]]
 
     def select(self, index: np.ndarray) -> 'Packed':
         """Return some of the messages."""
@@ -45,8 +53,20 @@ class Packed:
     def join(cls, messages: Sequence[bytes]) -> 'Packed':
         """Pack a list of bytes objects."""
         size = np.fromiter(map(len, messages), dtype=np.int64, count=len(messages))
-        start = np.concatenate([np.zeros(1, np.int64), np.cumsum(size)[:-1]]) if messages else size
-        return cls(np.frombuffer(b''.join(messages), dtype=np.uint8), start, size)
+        return cls(np.frombuffer(b''.join(messages), dtype=np.uint8), np.cumsum(size) - size, size)
+
+    @classmethod
+    def of_rows(cls, table: np.ndarray) -> 'Packed':
+        """Pack the rows of a byte table, one message each."""
+        count, size = table.shape
+        return cls(table.reshape(-1), size * np.arange(count), np.full(count, size))
+
+    @classmethod
+    def chain(cls, parts: Sequence['Packed']) -> 'Packed':
+        """Return the messages of all parts, one part after the other."""
+        sizes = [len(part.buffer) for part in parts]
+        start = [part.start + sum(sizes[:k]) for k, part in enumerate(parts)]
+        return cls(*(np.concatenate(each) for each in ([part.buffer for part in parts], start, [part.size for part in parts])))
 
 
 @dataclass(frozen=True, eq=False)

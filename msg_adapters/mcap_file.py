@@ -5,7 +5,7 @@ import struct
 import zlib
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from os import PathLike
@@ -16,7 +16,7 @@ import numpy as np
 
 from imu_calibration.core.documents import open_regular
 from msg_adapters.definitions import TypeDefinition
-from msg_adapters.layout import Packed
+from msg_adapters.layout import Packed, overlapping
 from msg_adapters.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -86,25 +86,23 @@ class McapWriter:
         self.channels[topic_id] = channel
         self.new_records += channel
 
-    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Sequence[memoryview]) -> None:
-        """Append messages: arrays of topic ids and receive times, and a list of byte strings."""
-        headers = np.zeros(len(messages), dtype=MESSAGE_HEADER)
-        size = np.fromiter(map(len, messages), dtype=np.int64, count=len(messages))
-        headers['opcode'], headers['length'], headers['channel'] = 0x05, size + 22, topic_ids
+    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
+        """Append messages: arrays of topic ids and receive times, and the messages."""
+        headers, head = np.zeros(len(messages), dtype=MESSAGE_HEADER), MESSAGE_HEADER.itemsize
+        headers['opcode'], headers['length'], headers['channel'] = 0x05, messages.size + 22, topic_ids
         headers['log_ns'] = headers['publish_ns'] = received_ns
-        end = np.cumsum(size + MESSAGE_HEADER.itemsize)
+        end = np.cumsum(messages.size + head)
+        place = end - messages.size - head
+        content = np.empty(end[-1], np.uint8)
+        overlapping(content, f'V{head}')[place] = headers.view(f'V{head}')
+        messages.copy_to(content, place + head)
         cuts = np.flatnonzero(np.diff(end // CHUNK_SIZE)) + 1
         for first, last in zip([0, *cuts], [*cuts, len(messages)], strict=True):
-            if first < last:
-                self._write_chunk(headers[first:last], size[first:last], messages[first:last])
+            self._write_chunk(headers[first:last], place[first:last] - place[first], content[place[first]:end[last - 1]])
 
-    def _write_chunk(self, headers, size, messages):
-        head, view = MESSAGE_HEADER.itemsize, memoryview(headers.view(np.uint8))
-        pieces = [self.new_records] + [b''] * (2 * len(messages))
-        pieces[1::2] = [view[start:start + head] for start in range(0, len(view), head)]
-        pieces[2::2] = messages
-        content = b''.join(pieces)
-        offset = len(self.new_records) + np.concatenate([np.zeros(1, np.int64), np.cumsum(size + head)[:-1]])
+    def _write_chunk(self, headers, offset, messages):
+        content = self.new_records + messages.tobytes()
+        offset += len(self.new_records)
         self.new_records = b''
         packed = self.compress(content)
         times = struct.pack('<QQ', int(headers['log_ns'].min()), int(headers['log_ns'].max()))

@@ -3,7 +3,7 @@
 import os
 import sqlite3
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing, suppress
 from functools import partial
 from itertools import islice
@@ -217,10 +217,10 @@ class SqliteWriter:
                 'INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash) '
                 'VALUES (?, ?, ?, ?)', (definition.type, definition.encoding, definition.text, definition.digest))
 
-    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Sequence[memoryview]) -> None:
-        """Append messages: arrays of topic ids and receive times, and a list of byte strings."""
+    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
+        """Append messages: arrays of topic ids and receive times, and the messages."""
         self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)',
-                                    zip(topic_ids.tolist(), received_ns.tolist(), messages, strict=True))
+                                    zip(topic_ids.tolist(), received_ns.tolist(), messages.views(), strict=True))
 
     def close(self, metadata_version: int, metadata: str) -> None:
         """Add the index by time and the metadata, and close."""

@@ -14,7 +14,7 @@ from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import DEFAULT_TOPICS, standard_definition
 from msg_adapters.imu import FIELDS, IMU_TYPE, N_DOUBLES, TEMPERATURE_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, encode_trajectory
-from msg_adapters.layout import from_ns
+from msg_adapters.layout import Packed, from_ns
 
 NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0)
 UNKNOWN = (0.0,) * 9
@@ -161,7 +161,7 @@ def write_trajectories(path: str | PathLike[str], parts: Sequence[tuple[int, Tra
     """
     with BagWriter(path, storage) as bag:
         number = bag.add_topic('joint_trajectory', standard_definition(JOINT_TRAJECTORY_TYPE))
-        messages = [memoryview(encode_trajectory(points)) for _, points in parts]
+        messages = Packed.join([encode_trajectory(points) for _, points in parts])
         bag.write(np.full(len(parts), number), np.array([stamp for stamp, _ in parts], np.int64), messages)
 
 
@@ -179,9 +179,6 @@ def _merged(received):
 def _write_batch(bag, ids, received, streams, parts):
     times = np.concatenate([times[part] for times, part in zip(received, parts, strict=True)])
     topic_ids = np.concatenate([np.full(part.stop - part.start, topic) for topic, part in zip(ids, parts, strict=True)])
-    messages = []
-    for (samples, encode), part in zip(streams, parts, strict=True):
-        if part.stop > part.start:
-            messages += rows(encode(samples.select(part)))
+    tables = [encode(samples.select(part)) for (samples, encode), part in zip(streams, parts, strict=True)]
     order = np.argsort(times, kind='stable')
-    bag.write(topic_ids[order], times[order], [messages[k] for k in order.tolist()])
+    bag.write(topic_ids[order], times[order], Packed.chain([Packed.of_rows(table) for table in tables]).select(order))

@@ -106,8 +106,7 @@ class BagPlayerNode(Node):
             for raw in self._bag.raw_stretches(self._topics):
                 due = np.maximum.accumulate(np.maximum((raw.received_ns - first_ns) * 1e-9 + offset, until))
                 until = float(due[-1])
-                messages = [raw.packed.view(k) for k in range(len(raw.packed))]
-                yield Batch(due, [self._players[k] for k in raw.topic], messages, until)
+                yield Batch(due, [self._players[k] for k in raw.topic], raw.packed.views(), until)
             offset = until + PAUSE
             if not self.settings.loop:
                 return

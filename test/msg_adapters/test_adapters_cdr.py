@@ -134,6 +134,17 @@ def test_broken_bytes_are_counted_and_never_raise(noise, message, cut):
     assert joints.decode(packed) is None and sum(joints.dropped.values()) == 4
 
 
+
+def test_messages_of_any_sizes_are_copied_to_their_places():
+    whole = [b'abc', b'', b'defgh', b'ijk']
+    packed = Packed.chain([Packed.join(whole), Packed.of_rows(np.arange(6, dtype=np.uint8).reshape(2, 3))]).select(np.array([5, 2, 1, 0, 4, 3]))
+    wanted = [b'\3\4\5', b'defgh', b'', b'abc', b'\0\1\2', b'ijk']
+    assert packed.views() == wanted
+    target = np.zeros(packed.size.sum() + 6, np.uint8)
+    packed.copy_to(target, np.cumsum(packed.size) - packed.size + np.arange(6))
+    assert target.tobytes() == b''.join(message + b'\0' for message in wanted)
+
+
 def test_more_layouts_than_are_worth_grouping():
     imu, _, _ = make_session(4 * MAX_LAYOUTS)
     data = [encode_imu(imu.select(slice(k, k + 1)), frame_id='f' * (k % (2 * MAX_LAYOUTS)))[0].tobytes() for k in range(len(imu))]

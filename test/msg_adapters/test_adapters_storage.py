@@ -34,7 +34,7 @@ class LinesWriter:
 
     def write(self, topic_ids, received_ns, messages):
         """Append messages."""
-        for topic_id, received, data in zip(topic_ids.tolist(), received_ns.tolist(), messages, strict=True):
+        for topic_id, received, data in zip(topic_ids.tolist(), received_ns.tolist(), messages.views(), strict=True):
             print(json.dumps(['message', topic_id, received, b64encode(data).decode()]), file=self.file)
 
     def close(self, _metadata_version, _metadata):

@@ -26,7 +26,8 @@ from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import standard_definition
 from msg_adapters.imu import IMU_TYPE
-from msg_adapters.write import encode_imu, rows, write_session
+from msg_adapters.layout import Packed
+from msg_adapters.write import encode_imu, write_session
 
 from worlds.physics import make_session, write_bag
 from worlds.physics_hand import hold_and_turn
@@ -527,7 +528,7 @@ def test_inspect_returns_the_worst_code_of_all_imus(capsys, tmp_path, session, t
         for k in range(2):
             imu = in_g(session.imu, None, None)[0] if k == bad else session.imu
             topic = bag.add_topic(f'/imu_{k}', standard_definition(IMU_TYPE))
-            bag.write(np.full(len(imu), topic), imu.stamp_ns, rows(encode_imu(imu)))
+            bag.write(np.full(len(imu), topic), imu.stamp_ns, Packed.of_rows(encode_imu(imu)))
     assert main(['inspect', str(tmp_path / 'bag')]) == 3
     assert 'accelerometer_scale 0.101972' in capsys.readouterr().out
     assert main(['inspect', str(tmp_path / 'bag'), '--imu-topic', f'/imu_{1 - bad}']) == 0
