@@ -174,6 +174,7 @@ class NoiseLikelihood:
         self.many, self.known = len(rows) >= LEAST_WINDOWS, known
         self._rows, self._white, self._times, self._sessions = rows, white, times, sessions
         self._likelihood, self._losses = RestrictedLikelihood(rows, times, sessions, information=information), {}
+        self._profiles = {}
 
     def loss(self, shape: tuple, used: Sequence[int] | np.ndarray | None = None, *, session: float = 0.0) -> float:
         """Return minus twice the restricted log likelihood with the parameters `used`, by default all."""
@@ -184,10 +185,11 @@ class NoiseLikelihood:
             within = means_beside_middles(processes, self._durations)[:, None]
             self._losses[key] = self._likelihood.whitened(self._white + within + offset**2, processes, step**2)
         logs, normal = self._losses[key]
-        if used is not None:
-            at = np.r_[used, len(normal) - 1]
-            normal = normal[np.ix_(at, at)]
-        return logs + profile(normal)
+        asked = (key, None if used is None else tuple(used))
+        if asked not in self._profiles:
+            at = np.arange(len(normal)) if used is None else np.r_[used, len(normal) - 1]
+            self._profiles[asked] = logs + profile(normal[np.ix_(at, at)])
+        return self._profiles[asked]
 
     def of_axis(self, axis: int, shape: tuple) -> 'NoiseLikelihood':
         """Return the likelihood of the noise of one axis, the other axes fixed at the shape; in units of the axis' own typical noise."""
