@@ -13,6 +13,8 @@ from imu_calibration.core.documents import from_text, plain, to_text
 from imu_calibration.core.errors import InputError, printable, shortened
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.exports.affine import AffineImu, Holding, Placement, as_mounted
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.kinematics.rotations import lever_matrix
 
 XYZ = 'XYZ'
 """Axes in the names of parameters."""
@@ -157,6 +159,23 @@ class Noise:
     """Whether the random walks are known: a noise document has them, a calibration has the white noise only."""
 
 
+STEPS = 30
+"""Fixed-point steps of the inversion: arms and g-sensitivity feel one another through small numbers."""
+
+
+def inverted(imu: AffineImu, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
+    """Return true (force, rate), the inverse of `AffineImu`; beyond its range of temperature the thermal part is that of the end."""
+    low, high = imu.temperature_range_c or (-np.inf, np.inf)
+    warmth = np.clip(readings.temperature_c, low, high) - imu.temperature_ref_c
+    force, turning = ((raw - imu.bias[sensor] - np.outer(warmth, imu.thermal[sensor])) @ np.linalg.inv(imu.matrix[sensor]).T
+                      for sensor, raw in zip(SENSORS, (readings.force, readings.rate)))
+    apparent, cross = force, np.linalg.solve(imu.matrix['gyroscope'], imu.cross)
+    for _ in range(STEPS):
+        rate = turning - force @ cross.T
+        force = apparent - np.einsum('nij,ij->ni', lever_matrix(rate, readings.alpha), imu.arms)
+    return force, rate
+
+
 @dataclass(frozen=True, eq=False)
 class Page:
     """Input of a writer."""
@@ -207,8 +226,6 @@ class Target:
     """Its frame, origin and axes of readings."""
     numbers: Callable[[AffineImu], Numbers] = lambda _imu: {}
     """The numbers of an IMU in its placement."""
-    corrected: Callable[[Numbers, Readings], tuple[np.ndarray, np.ndarray]] = lambda _numbers, readings: (readings.force, readings.rate)
-    """The program's own formula: specific force and rate that it makes of readings with these numbers."""
     noise: Callable[[Noise], Numbers] | None = None
     """The noise in its names and units; None: it uses none."""
     noise_is: str = ''
@@ -231,6 +248,10 @@ class Target:
     """Numbers that the program ignores, and its limits, a line each."""
     hint: str = ''
     """Instructions for the file or the program."""
+
+    def corrected(self, numbers: Numbers, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
+        """Return specific force and rate that the program makes of readings with these numbers."""
+        return (readings.force, readings.rate) if self.imu is None else inverted(self.imu(numbers), readings)
 
     @property
     def only_noise(self) -> bool:

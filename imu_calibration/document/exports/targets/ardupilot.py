@@ -10,7 +10,6 @@ from imu_calibration.document.exports.target import (
     XYZ,
     Page,
     Read,
-    Readings,
     Target,
     commented,
     plain,
@@ -43,26 +42,6 @@ def numbers(imu: AffineImu) -> dict:
             found |= {f'{TCAL}_{ORDER[sensor]}{power}_{a}': float(value) / PER_PARAMETER if power == 1 else 0.0
                       for power in (1, 2, 3) for a, value in zip(XYZ, imu.thermal[sensor])}
     return found
-
-
-def _polynomial(found, sensor, temperature_c):
-    warmth = temperature_c[:, None] - REFERENCE_C
-    return sum(vector_of(found, f'{TCAL}_{ORDER[sensor]}{power}_*') * PER_PARAMETER * warmth**power for power in (1, 2, 3))
-
-
-def _thermal(found, sensor, temperature_c):
-    if found.get(f'{TCAL}_ENABLE') != 1:
-        return np.zeros((len(temperature_c), 3))
-    low, high = found.get(f'{TCAL}_TMIN', DEFAULT_RANGE[0]), found.get(f'{TCAL}_TMAX', DEFAULT_RANGE[1])
-    then = np.array([found.get(CALTEMP[sensor], NO_TEMPERATURE)])
-    return _polynomial(found, sensor, np.clip(temperature_c, low, high)) - _polynomial(found, sensor, np.clip(then, low, high))
-
-
-def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``(raw - poly(T) + poly(CALTEMP) - OFFS) * SCAL``; gyroscopes have no scale."""
-    force = readings.force - _thermal(found, 'accelerometer', readings.temperature_c) - vector_of(found, OFFSET['accelerometer'] + '_*')
-    rate = readings.rate - _thermal(found, 'gyroscope', readings.temperature_c) - vector_of(found, OFFSET['gyroscope'] + '_*')
-    return force * vector_of(found, SCALE + '_*', 1.0), rate
 
 
 def imu(found: dict) -> AffineImu:
@@ -116,6 +95,6 @@ TARGETS = (Target(
     formula='(raw - poly(T) + poly(CALTEMP) - OFFS) * SCAL in forward-right-down axes before the turn of the board; gyroscopes: no SCAL\n'
             'poly(T) = 1e-6 (c1 dT + c2 dT^2 + c3 dT^3), dT = T - 35 C, T within TMIN..TMAX',
     source='ArduPilot/ardupilot, libraries/AP_InertialSensor/AP_InertialSensor_Backend.cpp, AP_InertialSensor_tempcal.cpp',
-    holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS, placement=forward_right_down, numbers=numbers, corrected=corrected,
+    holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS, placement=forward_right_down, numbers=numbers,
     write=write, read=read, imu=imu, back=forward_right_down, ignored=ignored,
     hint='of the first IMU; the readings must be uncalibrated, in the axes of the vehicle'),)

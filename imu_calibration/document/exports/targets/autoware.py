@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError, shortened
 from imu_calibration.document.exports.affine import OFFSETS, SCALES, AffineImu, of
-from imu_calibration.document.exports.target import Noise, Page, Read, Readings, Target, numbers_at, read_yaml, section, yaml_file
+from imu_calibration.document.exports.target import Noise, Page, Read, Target, numbers_at, read_yaml, section, yaml_file
 
 AXES = 'xyz'
 TOPIC = 'gyro_scale_input'
@@ -21,11 +21,6 @@ def numbers(imu: AffineImu) -> dict:
 
 def _offset(found):
     return np.array([found[f'angular_velocity_offset_{a}'] for a in AXES])
-
-
-def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``(rate - offset) / scale``; specific force passes as it is."""
-    return readings.force, (readings.rate - _offset(found)) / np.asarray(found[TOPIC])
 
 
 def imu(found: dict) -> AffineImu:
@@ -68,6 +63,6 @@ TARGETS = (Target(
     formula='rate = (raw - angular_velocity_offset) / gyro_scale_input; specific force unchanged\n'
             'covariances = stddev^2; after the rotation to base_link the largest of the three is used for all',
     source='autowarefoundation/autoware_universe, sensing/autoware_imu_corrector/src/imu_corrector_core.cpp',
-    holds=of('gyroscope', OFFSETS + SCALES), numbers=numbers, corrected=corrected, noise=noise, needs_walk=False,
+    holds=of('gyroscope', OFFSETS + SCALES), numbers=numbers, noise=noise, needs_walk=False,
     noise_is='discrete: standard deviation of a sample', write=write, read=read, imu=imu,
     hint='older versions name the switches on_off_correction.correct_for_bias and have no scale'),)

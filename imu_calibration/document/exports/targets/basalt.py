@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.document.exports.affine import MATRICES, OFFSETS, THERMAL_OFFSETS, AffineImu, accelerometer_lower
-from imu_calibration.document.exports.target import Noise, Page, Read, Readings, Target, numbers_at, plain, read_json, section
+from imu_calibration.document.exports.target import Noise, Page, Read, Target, numbers_at, plain, read_json, section
 
 LOWER_BY_COLUMNS = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
 
@@ -33,13 +33,6 @@ def imu(found: dict) -> AffineImu:
     """Return the IMU of such numbers."""
     matrix = {sensor: np.linalg.inv(turn) for sensor, (turn, _) in _parts(found).items()}
     return AffineImu(matrix=matrix, bias={sensor: matrix[sensor] @ bias for sensor, (_, bias) in _parts(found).items()})
-
-
-def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``raw + S raw - b`` of both sensors."""
-    parts = _parts(found)
-    (accel, accel_bias), (gyro, gyro_bias) = parts.values()
-    return readings.force @ accel.T - accel_bias, readings.rate @ gyro.T - gyro_bias
 
 
 def noise(found: Noise) -> dict:
@@ -72,6 +65,6 @@ TARGETS = (Target(
     formula='calibrated = (I + S) raw - b, the bias after the matrix\n'
             'accelerometer: b and the lower triangle of S, gyroscope: b and the full S, by columns',
     source='VladyslavUsenko/basalt-headers, calibration/calib_bias.hpp and calibration.hpp',
-    holds=OFFSETS + MATRICES, estimates=THERMAL_OFFSETS, placement=accelerometer_lower, numbers=numbers, corrected=corrected, noise=noise,
+    holds=OFFSETS + MATRICES, estimates=THERMAL_OFFSETS, placement=accelerometer_lower, numbers=numbers, noise=noise,
     noise_is='continuous, per axis', suffix='.json', write=write, read=read, imu=imu, axes='accelerometer_lower_triangular',
     hint="put these entries into the 'value0' of your calibration.json; the camera entries there must refer to the frame named above"),)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.document.exports.affine import MATRICES, OFFSETS, AffineImu, of
-from imu_calibration.document.exports.target import Page, Read, Readings, Target, numbers_at, read_yaml, yaml_file
+from imu_calibration.document.exports.target import Page, Read, Target, numbers_at, read_yaml, yaml_file
 
 
 def numbers(imu: AffineImu) -> dict:
@@ -16,12 +16,6 @@ def numbers(imu: AffineImu) -> dict:
 
 def _parts(found):
     return np.reshape(found['SM'], (3, 3)), np.asarray(found['bias'])
-
-
-def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``SM raw - bias`` of the accelerometer."""
-    matrix, bias = _parts(found)
-    return readings.force @ matrix.T - bias, readings.rate
 
 
 def imu(found: dict) -> AffineImu:
@@ -47,5 +41,5 @@ TARGETS = (Target(
     name='imu-calib', title='imu_calib YAML (ROS 1 and ROS 2)',
     formula='corrected = SM raw - bias of the accelerometer, SM by rows; the gyroscopes lose the mean of their first readings',
     source='dpkoch/imu_calib, src/accel_calib.cpp', holds=of('accelerometer', OFFSETS + MATRICES), estimates=of('gyroscope', OFFSETS),
-    numbers=numbers, corrected=corrected, write=write, read=read, imu=imu,
+    numbers=numbers, write=write, read=read, imu=imu,
     hint='set calibrate_gyros to true and keep the robot still at the start'),)

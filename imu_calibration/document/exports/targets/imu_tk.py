@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.exports.affine import MATRICES, OFFSETS, AffineImu, of
-from imu_calibration.document.exports.target import Read, Readings, Target, text_of
+from imu_calibration.document.exports.target import Read, Target, text_of
 
 ENDINGS = {'accelerometer': '.acc', 'gyroscope': '.gyro'}
 COUNT = 21
@@ -25,13 +25,6 @@ def imu(found: dict) -> AffineImu:
         inverse, bias[sensor] = _parts(found, sensor) if sensor in found else (np.eye(3), np.zeros(3))
         matrix[sensor] = np.linalg.inv(inverse)
     return AffineImu(matrix=matrix, bias=bias)
-
-
-def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``T K (raw - B)``."""
-    parts = [_parts(found, sensor) if sensor in found else (np.eye(3), np.zeros(3)) for sensor in ENDINGS]
-    force, rate = ((raw - bias) @ matrix.T for raw, (matrix, bias) in zip((readings.force, readings.rate), parts))
-    return force, rate
 
 
 def read(content: bytes, path: str | Path) -> Read:
@@ -65,4 +58,4 @@ def _invertible(values):
 TARGETS = (Target(
     name='imu-tk', title='imu_tk calibration', formula='calibrated = T K (raw - B)',
     source='A. Pretto, imu_tk, include/imu_tk/calibration.h',
-    holds=OFFSETS + MATRICES, corrected=corrected, read=read, imu=imu, axes='accelerometer_upper_triangular'),)
+    holds=OFFSETS + MATRICES, read=read, imu=imu, axes='accelerometer_upper_triangular'),)

@@ -16,12 +16,9 @@ from imu_calibration.document.exports.affine import (
     accelerometer_lower_at_x,
     lower_times_rotation,
 )
-from imu_calibration.document.exports.target import Noise, Page, Read, Readings, Target, numbers_at, read_yaml, section, yaml_file
+from imu_calibration.document.exports.target import Noise, Page, Read, Target, numbers_at, read_yaml, section, yaml_file
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.kinematics.rotations import lever_matrix
 
-STEPS = 30
-"""Fixed-point steps of the inversion: arms and g-sensitivity feel one another through small numbers."""
 LEVERS = ('rx_i', 'ry_i', 'rz_i')
 DENSITIES = {'accelerometer': ('accelerometer_noise_density', 'accelerometer_random_walk'),
              'gyroscope': ('gyroscope_noise_density', 'gyroscope_random_walk')}
@@ -47,25 +44,6 @@ def imu(found: dict) -> AffineImu:
     arms = np.array([accelerometers[name] for name in LEVERS]) if LEVERS[0] in accelerometers else np.zeros((3, 3))
     return AffineImu(matrix={'accelerometer': np.asarray(accelerometers['M']), 'gyroscope': np.asarray(gyroscopes['M']) @ turn},
                      cross=np.asarray(gyroscopes['A']) @ turn, arms=arms)
-
-
-def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return true (force, rate): the inverse of Kalibr's forward equations.
-
-    ``a = M (f + Ix W rx + Iy W ry + Iz W rz)`` with each arm's term picked before M, ``w = M C omega + A C f``.
-    """
-    accelerometers, gyroscopes = found['accelerometers'], found['gyroscopes']
-    turn = np.asarray(gyroscopes['C_gyro_i'])
-    inverse = {'a': np.linalg.inv(accelerometers['M']), 'w': np.linalg.inv(np.asarray(gyroscopes['M']) @ turn)}
-    cross = np.asarray(gyroscopes['A']) @ turn
-    arms = np.array([accelerometers.get(name, np.zeros(3)) for name in LEVERS])
-    apparent = readings.force @ inverse['a'].T
-    force, rate = apparent, readings.rate @ inverse['w'].T
-    for _ in range(STEPS):
-        rate = (readings.rate - force @ cross.T) @ inverse['w'].T
-        force = apparent - np.einsum('nij,ij->ni', lever_matrix(rate, readings.alpha), arms)
-    return force, rate
 
 
 def noise(found: Noise) -> dict:
@@ -114,7 +92,7 @@ TARGETS = (Target(
     formula='a_m = M (f + [W r]) + b with (W r)_i of the arm r_i of axis i, W = [alpha x] + [w x]^2\n'
             'w_m = M C_gyro_i w + A C_gyro_i f + b; M lower triangular; rx_i = 0: the origin is the x accelerometer',
     source='ethz-asl/kalibr, kalibr_imu_camera_calibration/IccSensors.py and kalibr_common/ConfigReader.py',
-    holds=MATRICES + G_SENSITIVITY + ARMS, estimates=SLOW_OFFSETS, placement=accelerometer_lower_at_x, numbers=numbers, corrected=corrected,
+    holds=MATRICES + G_SENSITIVITY + ARMS, estimates=SLOW_OFFSETS, placement=accelerometer_lower_at_x, numbers=numbers,
     noise=noise, noise_is='continuous: N in m/s^2/sqrt(Hz), rad/s/sqrt(Hz), K in m/s^3/sqrt(Hz), rad/s^2/sqrt(Hz)',
     write=write, read=read, imu=imu, back=at_the_mean, axes='accelerometer_lower_triangular',
     hint='Kalibr reads the topic, the rate and the noise, and estimates all other values; its intrinsics have the format of its output'),)

@@ -13,7 +13,7 @@ from imu_calibration.document.exports.affine import (
     lower_times_rotation,
     upper_times_rotation,
 )
-from imu_calibration.document.exports.target import Page, Read, Readings, Target, numbers_at, read_yaml, section, yaml_file
+from imu_calibration.document.exports.target import Page, Read, Target, numbers_at, read_yaml, section, yaml_file
 from imu_calibration.document.exports.targets.kalibr import noise, read_densities
 
 SHAPES = {'lower': lower_times_rotation, 'upper': upper_times_rotation}
@@ -30,13 +30,6 @@ def imu(found: dict) -> AffineImu:
     """Return the IMU of such numbers: ``a_m = Ta R_IMUtoACC f``, ``w_m = Tw R_IMUtoGYRO w + Tg f``."""
     tw, to_gyro, ta, to_acc, tg = (np.asarray(found[name]) for name in NAMES)
     return AffineImu(matrix={'accelerometer': ta @ to_acc, 'gyroscope': tw @ to_gyro}, cross=tg)
-
-
-def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
-    """Return (force, rate) as its propagation makes them."""
-    tw, to_gyro, ta, to_acc, tg = (np.asarray(found[name]) for name in NAMES)
-    force = readings.force @ (to_acc.T @ np.linalg.inv(ta)).T
-    return force, (readings.rate - force @ tg.T) @ (to_gyro.T @ np.linalg.inv(tw)).T
 
 
 def write(page: Page, model: str) -> str:
@@ -61,7 +54,7 @@ def _target(name: str, model: str, shape: str) -> Target:
         formula='f = R_IMUtoACC\' Ta^-1 (a_m - b); w = R_IMUtoGYRO\' Tw^-1 (w_m - b - Tg f)\n'
                 f'Ta and Tw {shape} triangular: the other half is not read by the model {model}',
         source='rpng/open_vins, ov_msckf/src/core/VioManagerOptions.h, state/Propagator.cpp, state/State.h',
-        holds=MATRICES + G_SENSITIVITY, estimates=SLOW_OFFSETS, numbers=partial(numbers, shape=shape), corrected=corrected,
+        holds=MATRICES + G_SENSITIVITY, estimates=SLOW_OFFSETS, numbers=partial(numbers, shape=shape),
         noise=noise, noise_is='continuous, as Kalibr', write=partial(write, model=model), read=read, imu=imu,
         hint='the file named by relative_config_imu; set calib_imu_intrinsics and calib_imu_g_sensitivity to false to keep these numbers')
 

@@ -10,7 +10,6 @@ from imu_calibration.document.exports.target import (
     XYZ,
     Page,
     Read,
-    Readings,
     Target,
     commented,
     plain,
@@ -44,24 +43,6 @@ def numbers(imu: AffineImu) -> dict:
             found |= {f'{short}0_X{power}_{axis}': float(value) if power == 1 else 0.0
                       for power in range(4) for axis, value in enumerate(imu.thermal[sensor])}
     return found
-
-
-def _thermal(found, sensor, temperature_c):
-    """Return the thermal offset, shape (n, 3)."""
-    short = f'{TC[sensor]}0'
-    if not found.get(f'{TC[sensor]}_ENABLE'):
-        return np.zeros((len(temperature_c), 3))
-    warmth = np.clip(temperature_c, found[f'{short}_TMIN'], found[f'{short}_TMAX']) - found[f'{short}_TREF']
-    return sum(warmth[:, None]**power * [found.get(f'{short}_X{power}_{axis}', 0.0) for axis in range(3)] for power in range(4))
-
-
-def corrected(found: dict, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``(raw - thermal - offset) * scale``; gyroscopes have no scale."""
-    made = {}
-    for sensor, raw in zip(SENSORS, (readings.force, readings.rate)):
-        offset, scale = vector_of(found, f'{CAL[sensor]}_*OFF'), vector_of(found, f'{CAL[sensor]}_*SCALE', 1.0)
-        made[sensor] = (raw - _thermal(found, sensor, readings.temperature_c) - offset) * scale
-    return made['accelerometer'], made['gyroscope']
 
 
 def imu(found: dict) -> AffineImu:
@@ -113,7 +94,7 @@ TARGETS = (Target(
     formula='(raw - thermal - OFF) * SCALE in forward-right-down axes; gyroscopes: no SCALE\n'
             'thermal = X0 + X1 (T - TREF) + ..., T within TMIN..TMAX',
     source='PX4/PX4-Autopilot, src/lib/sensor_calibration/Accelerometer.{hpp,cpp}, Gyroscope.hpp, temperature_compensation',
-    holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS, placement=forward_right_down, numbers=numbers, corrected=corrected,
+    holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS, placement=forward_right_down, numbers=numbers,
     write=write, read=read, imu=imu, back=forward_right_down, ignored=ignored,
     hint='set CAL_ACC0_ID and CAL_GYRO0_ID (TC_A0_ID, TC_G0_ID) to the device ids of these sensors, or PX4 ignores them;'
          ' the readings must be uncalibrated'),)
