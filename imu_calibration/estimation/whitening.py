@@ -216,8 +216,9 @@ class RestrictedLikelihood:
         white = Whitening(variance, self._times, self._sessions)(self._rows).reshape(-1, self._rows.shape[2])
         left = np.linalg.qr(white[:, :-1])[0]
         rest = white[:, -1] - left @ (left.T @ white[:, -1])
+        some = members.any(axis=0)   # the cost grows with the square of the rows
+        left, rest, weighted = left[some], rest[some], (members / variance.ravel())[:, some]
         redundancy = 1 - np.einsum('ij,ij->i', left, left)
-        weighted = members / variance.ravel()
         return 0.5 * weighted @ (rest**2 - redundancy), 0.5 * weighted @ (np.eye(len(left)) - left @ left.T)**2 @ weighted.T
 
 

@@ -65,16 +65,9 @@ def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndar
     inverse = np.linalg.inv(matrix)
     centred = rate_measured - bias if further is None else rate_measured - bias - further[0]
     rate = centred @ inverse.T
-    step = np.diff(time)
-    first, second = rate[:-1], rate[1:]
-    slopes = _slope_weights(time)
-    slope = slopes[1][:, None] * rate
-    slope[1:] += slopes[0][1:, None] * rate[:-1]
-    slope[:-1] += slopes[2][:-1, None] * rate[1:]
-    commutator = np.cross(first, second) - np.diff(slope, axis=0)
-    vectors = 0.5 * step[:, None] * (first + second) + MAGNUS_SECOND * (step**2)[:, None] * commutator
-    forward = _prefix_product(_quaternion(vectors))
-    mat_ki = _matrix_to_sensor(forward)
+    step, first, second, slopes = np.diff(time), rate[:-1], rate[1:], _slope_weights(time)
+    vectors = _rotation_vectors(rate, step, slopes)
+    mat_ki = _matrix_to_sensor(_prefix_product(_quaternion(vectors)))
     to_last = mat_ki[-1] @ np.swapaxes(mat_ki, 1, 2)
     gain = to_last @ _right_jacobian(vectors)
     weight = _per_sample(gain, step, first, second, slopes)
@@ -84,6 +77,22 @@ def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndar
     path = float(np.sum(0.5 * step * np.linalg.norm(first + second, axis=1)))
     integral = 0.5 * np.sum(step[:, None] * (centred[:-1] + centred[1:]), axis=0)
     return Turn(mat_ki[-1], -weight.sum(0) @ inverse, by_matrix, by_further, integral, path, float(time[-1] - time[0]))
+
+
+def total_rotation(time: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Return `Turn.mat_ji` of true rates, rad/s, shape (n, 3), without the derivatives, which take most of the time."""
+    vectors = _rotation_vectors(rate, np.diff(time), _slope_weights(time))
+    return _matrix_to_sensor(_prefix_product(_quaternion(vectors))[:, -1:])[0]
+
+
+def _rotation_vectors(rate, step, slopes):
+    """Return the rotation vector of each step (`integrate_turn`), shape (n - 1, 3)."""
+    first, second = rate[:-1], rate[1:]
+    slope = slopes[1][:, None] * rate
+    slope[1:] += slopes[0][1:, None] * first
+    slope[:-1] += slopes[2][:-1, None] * second
+    commutator = np.cross(first, second) - np.diff(slope, axis=0)
+    return 0.5 * step[:, None] * (first + second) + MAGNUS_SECOND * (step**2)[:, None] * commutator
 
 
 def small_rotation(vector: np.ndarray) -> np.ndarray:

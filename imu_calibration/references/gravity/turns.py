@@ -5,12 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, runs_of
-from imu_calibration.kinematics.strapdown import integrate_turn
+from imu_calibration.kinematics.strapdown import total_rotation
 from imu_calibration.preprocessing.full_scale import LEAST_TURNS, MOST_TURNS, believed_factor
 from imu_calibration.preprocessing.stamping import LAG, LATE, MOST_LOST, WHOLE
 from imu_calibration.references.gravity.equations import Poses, State, TurnData
 from imu_calibration.references.gravity.hand_options import KnownTurn
 
+LARGEST = 4000
+"""Largest readings among which the end of the range is searched."""
 TOP = 20
 """Readings below the largest whose density is estimated."""
 CROWDED = 20.0
@@ -79,7 +81,8 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
 
 def _at_end(values, fresh):
     """Return the rows with a value at the largest of all `values` (n, m), when that is the end of a range."""
-    some = np.sort(values[fresh].ravel())[-4000:]
+    some = values[fresh].ravel()
+    some = np.sort(np.partition(some, -LARGEST)[-LARGEST:] if len(some) > LARGEST else some)
     step = np.diff(some)
     step = step[step > 1e-9 * np.abs(some[-1])].min(initial=np.inf)
     margin = 1.5 * step if np.isfinite(step) and values.shape[1] > 1 else 0.5 * step   # two's complement: one end is larger by a step
@@ -176,5 +179,5 @@ def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> 
 def missed_angle(state: State, poses: Poses, turn: TurnData, *, matrix: np.ndarray) -> float:
     """Return the angle between rotated and observed gravity after a turn when the gyroscope reads `matrix` times the rate, rad."""
     bias = 0.5 * (poses.rate[turn.first] + poses.rate[turn.last])
-    mat_ji = integrate_turn(turn.time, turn.rate, bias=bias, matrix=matrix).mat_ji
+    mat_ji = total_rotation(turn.time, (turn.rate - bias) @ np.linalg.inv(matrix).T)
     return float(np.arccos(np.clip(mat_ji @ state.up[turn.first] @ state.up[turn.last], -1.0, 1.0)))
