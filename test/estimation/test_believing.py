@@ -65,7 +65,7 @@ def test_a_wrong_full_scale_setting_is_no_misfit():
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
     doubled = solved([replace(window, rate_s=2 * window.rate_s) for window in found.windows], model, table)
     assert not doubled.not_believed
-    np.testing.assert_allclose(np.diag(doubled.value('gyroscope', 'matrix').reshape(3, 3)), 2.0, atol=0.05)
+    np.testing.assert_allclose(np.diag(doubled.values[model.slices['gyroscope', 'matrix']].reshape(3, 3)), 2.0, atol=0.05)
 
 
 def test_the_earth_turns_only_where_the_table_says_where_it_stands():
