@@ -63,7 +63,7 @@ def _unused_rests(calibration):
         return []
     return [Reason(WARNING, f'the recording has {total} samples at rest, but no static window is used '
                    f'({", ".join(f"{count} {reason}" for reason, count in unused.items() if count)}): noise and bias changes '
-                   'come from motion alone, and the standard deviations of the biases may be too small',
+                   'come from motion only, and the standard deviations of the biases may be too small',
                    'reduce static_minimum, or increase quiet_ratio', key='setting')]
 
 
@@ -122,8 +122,8 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
             factor, unit = for_people(UNIT[sensor])
             reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by '
                                         f'{significant(scatter * factor, 2)} {unit}, more than '
-                                        'the tolerance on its bias: the mean is well known, the bias of the moment is not',
-                                  f'let the IMU warm up{"" if by_hand else " and the table stand firm"}, or estimate the bias in use',
+                                        'the tolerance on its bias: the mean is well determined, the present bias is not',
+                                  f'record after warm-up{"" if by_hand else ", on a rigid table"}, or estimate the bias in use',
                                   sensors=(sensor,)))
     return reasons
 
