@@ -18,6 +18,7 @@ from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.gravity.effect_rows import build_rows
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.model_selection import Inquiry, investigate_by_hand
@@ -138,6 +139,17 @@ def test_the_gain_is_the_error_of_corrected_readings_in_held_out_poses(respondin
     assert_allclose([gain.heldout_rms_before, gain.heldout_rms_after], np.sqrt(np.array(squares) / poses.rate.size), rtol=1e-7)
     of_model = found.gain([], found.named, 'gyroscope')
     assert of_model.of == OF_MODEL and abs(gain.heldout_rms_before / of_model.heldout_rms_before - 1) > 1e-3
+
+
+def test_the_variance_of_a_long_turn_includes_that_of_its_bias():
+    """Turns of 12 s between rests of 1 s: residuals have the stated variance, less the share of the nine fitted parameters."""
+    ratios = []
+    for seed in (21510, 21511):
+        imu, ranges, _ = simulate(seed, n_poses=24, still=1.0, duration=12.0)
+        data = gather_by_hand(imu, ranges)
+        turns = build_rows(solve_by_hand(data, HandOptions(GRAVITY)), data.turns, [], constants=np.zeros(0))[0][-1]
+        ratios.append(np.mean(turns.rows[:, :, -1]**2 / turns.known))
+    assert turns.name == 'turns' and 0.5 < np.mean(ratios) < 1.3, ratios
 
 
 def test_sizes_agree_with_what_was_hidden(responding):

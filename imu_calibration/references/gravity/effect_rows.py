@@ -150,7 +150,8 @@ def _turn_block(hand, turns, space, at_rest, moving):
     Two rows per turn: the direction after it against the direction before it rotated by the rates, over the turn's duration.
 
     The bias in a turn is the mean of the rates at rest before and after it, which removes its drift; the contributions of
-    further effects at rest are removed with it.
+    further effects at rest are removed with it. The variance of a row is ``N / T^2 + (s_i^2 + s_j^2) / 4`` with the noise N of the
+    integrated rates, rad^2, the duration T and the standard errors s of the two means.
     """
     bias_f, matrix_f = hand.accelerometer
     matrix = hand.gyroscope[1]
@@ -174,6 +175,7 @@ def _turn_block(hand, turns, space, at_rest, moving):
         row[:, -1] = -across[j].T @ carried / found.duration
         rows.append(row)
         durations.append(found.duration)
-        known.append(np.full(2, turn.noise_variance / found.duration**2))
+        of_bias = 0.25 * np.mean(hand.poses.rate_sem[[i, j]]**2, axis=1).sum()
+        known.append(np.full(2, turn.noise_variance / found.duration**2 + of_bias))
     return Block('turns', 'gyroscope', np.array(rows), np.array(known), np.array(known), np.array([turn.first for turn in turns]),
                  np.array([turn.time.mean() for turn in turns]), np.array(durations))
