@@ -8,7 +8,7 @@ from scipy.special import chdtrc
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import Role
-from imu_calibration.estimation.solution import HELD
+from imu_calibration.estimation.solution import FIXED, HELD
 
 LEVEL = 0.01
 """Significance level: two calibrations differ when the p-value is below this."""
@@ -29,7 +29,7 @@ class Row:
     unit: str
     """SI unit."""
     ratio: float | None
-    """Difference in combined standard deviations; None when either is held, or the uncertainty of neither is known."""
+    """Difference in combined standard deviations; None when either is held or fixed, or the uncertainty of neither is known."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     difference = second.values[b] - first.values[a]
     parts = [c.covariance[np.ix_(at, at)] for c, at in ((first, a), (second, b)) if c.uncertainty_known]
     covariance = sum(parts, np.zeros((len(common), len(common))))
-    held = np.array([first.status[i] == HELD or second.status[j] == HELD for i, j in zip(a, b)])
+    held = np.array([bool({first.status[i], second.status[j]} & {HELD, FIXED}) for i, j in zip(a, b)])
     sd = np.sqrt(np.diag(covariance))
     units = {name: effect.unit_of(k) for effect in first.model.effects for k, name in enumerate(effect.param_names())}
     rows = tuple(Row(name, float(first.values[i]), float(second.values[j]), float(s), units[name], None if h or not parts else _ratio(d, s))
@@ -87,7 +87,7 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
         lines.append('off-diagonal terms of a matrix include how the IMU was mounted on the table: '
                      'they differ after remounting without a change of the IMU')
     if held.any():
-        lines.append(f'{int(held.sum())} parameters are held in one of them and were not compared')
+        lines.append(f'{int(held.sum())} parameters are held or fixed in one of them and were not compared')
     if len(parts) < 2:
         lines.append('agreement of the calibrations cannot be tested: the uncertainties of imported values are unknown')
         return Comparison(rows, None, tuple(lines))

@@ -13,7 +13,7 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.comparison import LEVEL, compare
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solution import DETERMINED, HELD
+from imu_calibration.estimation.solution import DETERMINED, FIXED, HELD
 
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
 COUNT = len(MODEL.param_names)
@@ -60,10 +60,12 @@ def test_a_parameter_that_moved_is_found_and_its_group_named(name):
     assert all(row.ratio == 0 for row in result.rows if row.name != name)
 
 
-def test_held_parameters_are_not_compared():
+@pytest.mark.parametrize('status', [HELD, FIXED])
+def test_held_and_fixed_parameters_are_not_compared(status):
+    """The sd of a parameter that the axes fix is zero, which makes any difference infinite."""
     one = draw(np.random.default_rng(4))
     name = 'gyroscope.matrix.xx'
-    held = replace(one, status=tuple(HELD if n == name else s for n, s in zip(one.param_names, one.status)))
+    held = replace(one, status=tuple(status if n == name else s for n, s in zip(one.param_names, one.status)))
     result = compare(moved(held, name, 1.0), one)
     assert result.agree
     assert next(row for row in result.rows if row.name == name).ratio is None
