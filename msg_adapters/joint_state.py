@@ -147,7 +147,8 @@ def _store() -> Any:
 
 def encode_trajectory(points: TrajectoryPoints) -> bytes:
     """Return TrajectoryPoints as plain little-endian CDR, without a frame, to begin at their arrival."""
-    types, columns, none = _store().types, points.columns(), np.zeros(0)
+    types, none = _store().types, np.zeros(0)
+    columns = {name: np.ascontiguousarray(values) for name, values in points.columns().items()}   # each row is serialized as its bytes
     duration = types['builtin_interfaces/msg/Duration']
     listed = [types['trajectory_msgs/msg/JointTrajectoryPoint'](*(columns[name][k] if name in columns else none for name in _FIELDS), none,
                                                                 duration(*divmod(round(time * NS_PER_S), NS_PER_S)))

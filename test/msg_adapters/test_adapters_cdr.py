@@ -210,6 +210,16 @@ def test_the_written_definitions_are_the_standard_ones(message_type):
     assert is_standard(message_type, 'ros2msg', definition.text)
 
 
+def test_a_trajectory_is_written_whatever_the_order_of_its_arrays_in_memory():
+    """Arrays with the instants along the last axis were refused by the serializer: the planner could not move."""
+    values = np.random.default_rng(1).normal(size=(3, 5, 2))
+    values[1, -1] = 0.0   # at rest at the end
+    transposed = [np.asfortranarray(each) for each in values]
+    assert not transposed[0][1].flags.c_contiguous
+    time = np.arange(1.0, 6.0)
+    assert encode_trajectory(TrajectoryPoints(('a', 'b'), time, *transposed)) == encode_trajectory(TrajectoryPoints(('a', 'b'), time, *values))
+
+
 @quick
 @given(st.lists(frames, max_size=4, unique=True), st.integers(0, 5), st.integers(0, 2), frames)
 def test_a_trajectory_is_written_as_rosbags_reads_it_and_comes_back(names, n_points, n_derivatives, frame):
