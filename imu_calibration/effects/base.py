@@ -51,6 +51,10 @@ class Role(Enum):
     """A term, or a warp, of its own."""
 
 
+Values = dict[str, np.ndarray]
+"""Effect name -> values of the effects of a sensor; column group -> coefficients."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Effect:
     """
@@ -100,7 +104,7 @@ class Effect:
     group_sensors: tuple = ()
     """Sensor that each of the groups belongs to, where they differ; empty: all sensors that it acts on."""
     coefficients: Callable | None = None
-    """``coefficients(values, point) -> {group name: (n_columns, 3)}`` with `values` a dict effect name -> array of the sensor."""
+    """``coefficients(effect, values, point) -> {group name: (n_columns, 3)}`` with `values` as `Values`."""
     warp: Callable | None = None
     """``warp(table, motion, values) -> [(weight, table, motion), ...]``."""
     derivative: Callable | None = None
@@ -272,101 +276,49 @@ def signed_coefficients(axes: np.ndarray) -> np.ndarray:
     return block.reshape(9, 3)
 
 
-@dataclass(frozen=True)
-class Amplitudes:
+def amplitude_coefficients(effect: Effect, values: Values, point: dict[str, Any], *, own_axis: bool = False) -> Values:
     """
-    Values straight before the columns: ``output_i = sum_k value_ik column_k``.
+    Return values straight before the columns: ``output_i = sum_k value_ik column_k``.
 
-    With three amplitudes and three columns each column may belong to one axis only. A last value that is a time constant is accompanied
-    by the columns' derivatives by it.
+    With three amplitudes and three columns each column may belong to one axis only (`own_axis`). A last value that is a time constant is
+    accompanied by the columns' derivatives by it.
     """
-
-    effect: str
-    """Name of the effect."""
-    group: str
-    """Name of its columns."""
-    own_axis: bool = False
-    """Whether column i acts on axis i only."""
-    time_constant: bool = False
-    """Whether the last value is a time constant."""
-
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
-        """Return the coefficients."""
-        own = values[self.effect]
-        amplitudes = own[:-1] if self.time_constant else own
-        block = np.diag(amplitudes) if self.own_axis else amplitudes.reshape(3, -1).T
-        if self.time_constant:
-            block = np.concatenate([block, block * (own[-1] - point[self.effect][-1])])
-        return {self.group: block}
+    own = values[effect.name]
+    amplitudes = own[:-1] if effect.time_constant else own
+    block = np.diag(amplitudes) if own_axis else amplitudes.reshape(3, -1).T
+    if effect.time_constant:
+        block = np.concatenate([block, block * (own[-1] - point[effect.name][-1])])
+    return {effect.groups[0].name: block}
 
 
-@dataclass(frozen=True)
-class AlongAxis:
-    """
-    Values before a function of the input along each element's own axis.
-
-    ``function(input axes)`` gives the coefficients of one of each.
-    """
-
-    effect: str
-    group: str
-    function: Callable
-
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
-        """Return the coefficients."""
-        return {self.group: self.function(input_axes(values)) * values[self.effect][None, :]}
+def along_axis_coefficients(effect: Effect, values: Values, point: dict[str, Any], *, function: Callable) -> Values:
+    """Return values before a function of the input along each element's own axis; ``function(input axes)`` gives one of each."""
+    return {effect.groups[0].name: function(input_axes(values)) * values[effect.name][None, :]}
 
 
-@dataclass(frozen=True)
-class Products:
-    """Values before the last three of six products, which are of different components."""
-
-    effect: str
-    group: str
-
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
-        """Return the coefficients."""
-        block = values[self.effect].reshape(3, 3).T
-        return {self.group: np.concatenate([np.zeros((3, 3), block.dtype), block])}
+def product_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
+    """Return values before the last three of six products, which are of different components."""
+    block = values[effect.name].reshape(3, 3).T
+    return {effect.groups[0].name: np.concatenate([np.zeros((3, 3), block.dtype), block])}
 
 
-@dataclass(frozen=True)
-class OfOthers:
-    """Two values for each axis, before the columns of the two other axes."""
-
-    effect: str
-    group: str
-
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
-        """Return the coefficients."""
-        block = np.zeros((3, 3), values[self.effect].dtype)
-        block[~np.eye(3, dtype=bool)] = values[self.effect]
-        return {self.group: block.T}
+def cross_axis_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
+    """Return two values for each axis, before the columns of the two other axes."""
+    block = np.zeros((3, 3), values[effect.name].dtype)
+    block[~np.eye(3, dtype=bool)] = values[effect.name]
+    return {effect.groups[0].name: block.T}
 
 
-@dataclass(frozen=True)
-class OfMatrix:
-    """The sensor's matrix, or its rows times one value per axis."""
-
-    effect: str
-    group: str
-
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
-        """Return the coefficients."""
-        matrix = values['matrix'].reshape(3, 3)
-        return {self.group: matrix.T if self.effect == 'matrix' else (matrix * values[self.effect][:, None]).T}
+def matrix_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
+    """Return the sensor's matrix, or its rows times one value per axis."""
+    matrix = values['matrix'].reshape(3, 3)
+    return {effect.groups[0].name: matrix.T if effect.name == 'matrix' else (matrix * values[effect.name][:, None]).T}
 
 
-@dataclass(frozen=True)
-class LeverArms:
-    """Coefficients of the lever matrix W_jk for output i: m_ij r_ik (Zhang 2017, eq. 11-17 with the true inverse)."""
-
-    effect: str
-
-    def __call__(self, values: dict[str, np.ndarray], point: dict[str, Any]) -> dict[str, np.ndarray]:
-        """Return the coefficients; one arm is repeated for three."""
-        matrix, arms = values['matrix'].reshape(3, 3), np.broadcast_to(values[self.effect].reshape(-1, 3), (3, 3))
-        return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}
+def lever_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
+    """Return the coefficients of the lever matrix W_jk for output i: m_ij r_ik (Zhang 2017, eq. 11-17 with the true inverse)."""
+    matrix, arms = values['matrix'].reshape(3, 3), np.broadcast_to(values[effect.name].reshape(-1, 3), (3, 3))   # one arm for all three
+    return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}
 
 
 def input_axes(values: dict[str, np.ndarray]) -> np.ndarray:

@@ -4,11 +4,11 @@ import copyreg
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 from imu_calibration.core.errors import InputError, did_you_mean, shortened
-from imu_calibration.effects.base import AXES, SECTIONS, SENSORS, VECTOR, Amplitudes, Effect
+from imu_calibration.effects.base import AXES, SECTIONS, SENSORS, VECTOR, Effect, amplitude_coefficients
 from imu_calibration.effects.expressions import ColumnGroup
 from imu_calibration.effects.reference_effects import reference_effects
 from imu_calibration.effects.sensor_effects import ACCELEROMETER, GYROSCOPE
@@ -102,7 +102,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
         explanation=_explanation(text, sensor, columns), needs=needs,
         motion=next((motions for quantity, motions in MOTIONS if quantity in group.uses), ('static_poses',)),
         compensation='none' if group.uses & {'time', 'attitude', *JOINT_INPUTS} else 'exact', groups=(group,),
-        coefficients=Amplitudes(name, name, len(columns) == 3, settles),
+        coefficients=partial(amplitude_coefficients, own_axis=len(columns) == 3),
         smooth=not group.uses - {'time', 'temperature', 'thermal branch', 'reference temperature', 'time constant'},
         plausible=(('such', largest, 'its definition'),) if largest else (),
         definition={key: value for key, value in definition.items() if value is not None},

@@ -171,7 +171,7 @@ def _add_coefficients(total, model, effect, of_sensor, layout):
             products = (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T
             total[layout.rows[WARP_LEVER + effect.name]] += (change[:, None, None] * products[None]).reshape(-1, 3)
     elif effect.coefficients is not None:
-        for group, block in effect.coefficients(of_sensor, layout.point).items():
+        for group, block in effect.coefficients(effect, of_sensor, layout.point).items():
             if group in layout.rows:   # an effect on both sensors has groups of each
                 total[layout.rows[group]] += block
 
@@ -208,12 +208,12 @@ def effect_slopes(effect: Effect, of_sensor: dict[str, np.ndarray],
     coefficients = effect.coefficients
     if coefficients is None:
         raise ValueError(f'{effect.name} has no coefficients')
-    found = coefficients(of_sensor, point)
+    found = coefficients(effect, of_sensor, point)
     slopes = {group: np.zeros(block.shape + (effect.size,)) for group, block in found.items()}
     for k in range(effect.size):
         moved = of_sensor[effect.name].astype(complex)
         moved[k] += 1e-30j
-        for group, block in coefficients({**of_sensor, effect.name: moved}, point).items():
+        for group, block in coefficients(effect, {**of_sensor, effect.name: moved}, point).items():
             slopes[group][..., k] = np.imag(block) / 1e-30
     return found, slopes
 

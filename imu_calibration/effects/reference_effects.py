@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -122,33 +122,14 @@ def _changed(change, table, values):
     return change(table, np.array(values))
 
 
-def _tilt(table, motion, values):
-    return [(1.0, _changed(tilt, table, tuple(values)), motion)]
+def _of_table(change, table, motion, values):
+    """Return the warp of an effect that changes the table: ``change(table, values)``."""
+    return [(1.0, _changed(change, table, tuple(values)), motion)]
 
 
 def _tilt_derivative(ref):
     """Derivative of ``mat_sn @ (up + theta x up) g`` with respect to (theta_x, theta_y)."""
     return ref.gravity * np.concatenate([-ref.mat_sn[:, :, 1], ref.mat_sn[:, :, 0]], axis=1)
-
-
-def _axes(table, motion, values):
-    """Turn each axis against the axis before it."""
-    return [(1.0, _changed(with_axis_angles, table, tuple(values)), motion)]
-
-
-def _places(table, motion, values):
-    """Shift each turning axis but the first sideways."""
-    return [(1.0, _changed(with_axis_places, table, tuple(values)), motion)]
-
-
-def _sag(table, motion, values):
-    """Bend the axes after the first one under their weight."""
-    return [(1.0, _changed(with_sag, table, tuple(values)), motion)]
-
-
-def _wobble(table, motion, values):
-    """Tilt each axis as it turns."""
-    return [(1.0, _changed(with_wobble, table, tuple(values)), motion)]
 
 
 def _zero(table, motion, values):
@@ -182,7 +163,7 @@ def _late_after(table, motion, values):
     return [(1.0, table, shifted(motion, values[0] * (motion.time >= values[1])))]
 
 
-def _earth(values, point):
+def _earth(effect, values, point):
     """Coefficients of the attitude columns: matrix_ij C_jk earth_k."""
     matrix = values['matrix'].reshape(3, 3)
     return {ATTITUDE.name: (matrix[:, :, None] * values['earth_rate'][None, None, :]).reshape(3, 9).T}
@@ -199,7 +180,7 @@ def _earth_known(table):
             'omit the azimuth in the table description')
 
 
-def _bent(values, point):
+def _bent(effect, values, point):
     """
     Coefficients of a mount that turns by theta = K f with the force that it carries, to first order.
 
@@ -227,13 +208,13 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             explanation='The table is not level: its vertical is rotated by a small angle about the base axes.',
             tolerance_reason='0.1 mg at 1 g, a tenth of the accelerometer bias', prior_sd=2e-3,
             plausible=(('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),), motion=('turn_about_vertical',),
-            warp=_tilt, derivative=_tilt_derivative, acts_on=('accelerometer',), needs=('joints',)),
+            warp=partial(_of_table, tilt), derivative=_tilt_derivative, acts_on=('accelerometer',), needs=('joints',)),
         Effect(
             **of_table, name='axis_non_orthogonality', components=names.angles, shape=(len(names.angles),),
             explanation='The angles between the axes of the table differ from its description.',
             tolerance_reason='as the tilt', prior_sd=names.angle_sd or 0.01,
             plausible=(('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),),
-            motion=('two_axis', 'static_dense'), warp=_axes, needs=('joints', 'two_joints')),
+            motion=('two_axis', 'static_dense'), warp=partial(_of_table, with_axis_angles), needs=('joints', 'two_joints')),
         Effect(
             **of_table, name='encoder_zero', sudden=True, components=names.zeros, shape=(len(names.zeros),),
             explanation='The zero of an inner joint angle differs from the table description.',
@@ -245,7 +226,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             explanation='The axes do not pass through the points of the description.',
             tolerance_reason='0.1 mm, 0.01 m/s^2 at 10 rad/s', prior_sd=names.place_sd or 1e-3,
             plausible=(('arm', 0.01, 'lengths of arms: 0.1-1 mm after a calibration of their own'),), motion=('two_axis', 'three_speeds'),
-            warp=_places, acts_on=('accelerometer',), needs=('joints', 'two_joints', 'dynamic')),
+            warp=partial(_of_table, with_axis_places), acts_on=('accelerometer',), needs=('joints', 'two_joints', 'dynamic')),
         Effect(
             **of_table, name='encoder_harmonic', shape=(len(names.turning), len(ORDERS), 2),
             components=tuple(f'{name}_{kind}{order}' for name in names.turning for order in ORDERS for kind in ('cos', 'sin')),
@@ -258,14 +239,14 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             'like a loaded shaft.',
             tolerance_reason='as the tilt', prior_sd=2e-3,
             plausible=(('bench', 3e-3, 'field catalogue 6.3: arcsec to 10 arcmin of a slender shaft'),),
-            motion=('static_dense', 'two_axis'), warp=_sag, needs=('joints', 'two_joints')),
+            motion=('static_dense', 'two_axis'), warp=partial(_of_table, with_sag), needs=('joints', 'two_joints')),
         Effect(
             **of_table, name='axis_wobble', shape=(len(names.turning), len(WOBBLES), 2),
             components=tuple(f'{name}_{kind}{order:+d}' for name in names.turning for order in WOBBLES for kind in ('cos', 'sin')),
             explanation='An axis wobbles: it leans another way at every angle of its turn, as a bearing out of round makes it.',
             tolerance_reason='as the tilt', prior_sd=2e-3,
             plausible=(('bench', 3e-3, 'field catalogue 6.3: arcsec; 10 arcmin of a worn bearing'),),
-            motion=('slow_turn', 'two_axis'), warp=_wobble, needs=('joints',)),
+            motion=('slow_turn', 'two_axis'), warp=partial(_of_table, with_wobble), needs=('joints',)),
         Effect(
             **of_table | {'unit': 'rad/(m/s^2)', 'against': ('force',), 'tolerance': 1e-4 / STANDARD_GRAVITY}, name='load_compliance',
             components=MATRIX, shape=(3, 3),

@@ -1,5 +1,7 @@
 """Effects of the sensors themselves; accelerometer and gyroscope share the mechanisms, so each is declared for both at once."""
 
+from functools import partial
+
 import numpy as np
 
 from imu_calibration.core.units import DEG, MILLI_G, STANDARD_GRAVITY
@@ -12,14 +14,14 @@ from imu_calibration.effects.base import (
     SHORT,
     UNIT,
     VECTOR,
-    AlongAxis,
-    Amplitudes,
     Effect,
-    LeverArms,
-    OfMatrix,
-    OfOthers,
-    Products,
     Role,
+    along_axis_coefficients,
+    amplitude_coefficients,
+    cross_axis_coefficients,
+    lever_coefficients,
+    matrix_coefficients,
+    product_coefficients,
 )
 
 SHAKEN = 0.05
@@ -42,9 +44,6 @@ def _pair(sensor):
     own = {group: getattr(base, group)[sensor] for group in ('TRUE_INPUT', 'SQUARES', 'SIGNED', 'THERMAL', 'CHANGE', 'WARM_UP')}
     curved = ('static_dense', 'centrifuge') if accel else ('three_speeds',)
 
-    def along_axis(name, group, function):
-        return {'groups': (own[group],), 'coefficients': AlongAxis(name, own[group].name, function)}
-
     return (
         Effect(
             name='bias', sensor=sensor, role=Role.OFFSET, components=VECTOR, shape=(3,), unit=unit,
@@ -52,7 +51,7 @@ def _pair(sensor):
             tolerance=small,
             tolerance_reason='1 mg, which tilts a levelled attitude by 1 mrad' if accel else '0.01 deg/s, 0.6 deg of heading a minute',
             prior_sd=2.0 if accel else 0.2, plausible=(('consumer', 1.0 if accel else 0.1, 'field catalogue 6.1, 6.2'),),
-            motion=('static_poses',), compensation='exact', groups=(base.ONE,), coefficients=Amplitudes('bias', 'one')),
+            motion=('static_poses',), compensation='exact', groups=(base.ONE,), coefficients=amplitude_coefficients),
         Effect(
             name='matrix', sensor=sensor, role=Role.LINEAR, components=MATRIX, shape=(3, 3), unit='1',
             title='matrix (scale factors and axis directions)',
@@ -60,7 +59,7 @@ def _pair(sensor):
             tolerance=1e-3,
             tolerance_reason='1 mg at 1 g, as much as the bias; 1 mrad of installation angle' if accel else '0.36 deg in one full turn',
             prior=tuple(np.eye(3).ravel()), prior_sd=0.1, motion=('static_poses',) if accel else ('spin_x', 'spin_y', 'spin_z'),
-            compensation='exact', groups=(own['TRUE_INPUT'],), coefficients=OfMatrix('matrix', kind)),
+            compensation='exact', groups=(own['TRUE_INPUT'],), coefficients=matrix_coefficients),
         Effect(
             name=f'{short}_quadratic', sensor=sensor, components=VECTOR, shape=(3,), unit=f'({unit})^-1', against=(kind,),
             explanation=f'The {sensor} output bends with the square of its input (K2), '
@@ -69,13 +68,15 @@ def _pair(sensor):
             prior_sd=100 * small / full**2,
             plausible=(('consumer', 4e-4 / STANDARD_GRAVITY if accel else 0.5 * DEG / (100 * DEG)**2, 'ADIS16460 data sheet: '
                         '0.1 % / 0.5 % of range'),),
-            motion=curved, compensation='exact', **along_axis(f'{short}_quadratic', 'SQUARES', base.square_coefficients)),
+            motion=curved, compensation='exact', groups=(own['SQUARES'],),
+            coefficients=partial(along_axis_coefficients, function=base.square_coefficients)),
         Effect(
             name=f'{short}_scale_asymmetry', sensor=sensor, components=VECTOR, shape=(3,), unit='1', against=(kind,),
             explanation=f'The {sensor} scale factor differs between positive and negative input.',
             tolerance=1e-3, tolerance_reason='1 mg between +1 g and -1 g' if accel else 'as the matrix', prior_sd=0.05,
             plausible=(('consumer', 2e-3, 'field catalogue 6.1: 100-200 ppm typical'),),
-            motion=curved, compensation='exact', **along_axis(f'{short}_scale_asymmetry', 'SIGNED', base.signed_coefficients)),
+            motion=curved, compensation='exact', groups=(own['SIGNED'],),
+            coefficients=partial(along_axis_coefficients, function=base.signed_coefficients)),
         Effect(
             name=f'{short}_thermal_bias', sensor=sensor, components=VECTOR, shape=(3,), unit=f'{unit}/K', against=('temperature',),
             smooth=True,
@@ -83,7 +84,7 @@ def _pair(sensor):
             tolerance=0.1 * small, tolerance_reason='1 mg over 10 K' if accel else '0.01 deg/s over 10 K', prior_sd=10 * small,
             plausible=(('consumer', 2 * MILLI_G if accel else 0.05 * DEG, 'ADXL358, ADIS16460 data sheets, ten times typical'),),
             motion=('warm_up',), compensation='exact', needs=('temperature',),
-            groups=(base.TEMPERATURE,), coefficients=Amplitudes(f'{short}_thermal_bias', 'temperature')),
+            groups=(base.TEMPERATURE,), coefficients=amplitude_coefficients),
         Effect(
             name=f'{short}_thermal_bias_2', sensor=sensor, components=VECTOR, shape=(3,), unit=f'{unit}/K^2', against=('temperature',),
             smooth=True,
@@ -92,7 +93,7 @@ def _pair(sensor):
             tolerance=0.01 * small, tolerance_reason='1 mg over 10 K' if accel else '0.01 deg/s over 10 K', prior_sd=small,
             plausible=(('consumer', 0.1 * MILLI_G if accel else 2.5e-3 * DEG, 'as much as the first order over 20 K'),),
             motion=('warm_up',), compensation='exact', needs=('temperature',),
-            groups=(base.TEMPERATURE_SQUARED,), coefficients=Amplitudes(f'{short}_thermal_bias_2', 'temperature_squared')),
+            groups=(base.TEMPERATURE_SQUARED,), coefficients=amplitude_coefficients),
         Effect(
             name=f'{short}_thermal_hysteresis', sensor=sensor, components=VECTOR, shape=(3,), unit=unit, against=('temperature',),
             smooth=True,
@@ -101,7 +102,7 @@ def _pair(sensor):
             tolerance=small, tolerance_reason='as the bias', prior_sd=20 * small,
             plausible=(('consumer', 5 * MILLI_G if accel else 0.1 * DEG, 'as much as the thermal bias over some kelvins'),),
             motion=('warm_and_cool',), compensation='exact', needs=('temperature', 'cooling'),
-            groups=(base.BRANCH,), coefficients=Amplitudes(f'{short}_thermal_hysteresis', 'thermal_branch')),
+            groups=(base.BRANCH,), coefficients=amplitude_coefficients),
         Effect(
             name=f'{short}_vibration_rectification', sensor=sensor, components=VECTOR if accel else MATRIX, shape=(3,) if accel else (3, 3),
             unit=f'{unit}/(m/s^2)^2', against=('time',),
@@ -112,14 +113,14 @@ def _pair(sensor):
             plausible=(('consumer', 2.0 if accel else 0.1, ('2 mg/g^2 (ADXL358 data sheet)' if accel else '0.05 deg/s/g^2')
                         + ', where a hundredth of the amplitude is left in the band'),),
             motion=('shake',), compensation='exact', needs=('vibration',), groups=(base.VIBRATION,),
-            coefficients=Amplitudes(f'{short}_vibration_rectification', 'vibration', own_axis=accel)),
+            coefficients=partial(amplitude_coefficients, own_axis=accel)),
         Effect(
             name=f'{short}_thermal_scale', sensor=sensor, components=VECTOR, shape=(3,), unit='1/K', against=('temperature',),
             explanation=f'The {sensor} scale factor follows the temperature.',
             tolerance=1e-4, tolerance_reason='1e-3 over 10 K', prior_sd=0.01,
             plausible=(('consumer', 1e-3, 'ADXL358, ADIS16460 data sheets'),),
             motion=('warm_up',), compensation='exact', needs=('temperature',) if accel else ('temperature', 'rotation'),
-            groups=(own['THERMAL'],), coefficients=OfMatrix(f'{short}_thermal_scale', own['THERMAL'].name)),
+            groups=(own['THERMAL'],), coefficients=matrix_coefficients),
         Effect(
             name=f'{short}_cross_axis_lag', sensor=sensor, components=OTHERS, shape=(3, 2), unit='s', against=('rate',),
             explanation=f'Each {sensor} axis has crosstalk of the remaining axes with a different lag: '
@@ -127,7 +128,7 @@ def _pair(sensor):
             tolerance=1e-5, tolerance_reason='1 mrad of cross coupling through a lag of 10 ms', prior_sd=1e-3,
             plausible=(('consumer', 5e-4, '10 mrad of cross coupling through a lag of 50 ms'),),
             motion=('oscillate_fast', 'two_axis'), compensation='exact', needs=('rotation',), moot=_one_axis,
-            groups=(own['CHANGE'],), coefficients=OfOthers(f'{short}_cross_axis_lag', own['CHANGE'].name)),
+            groups=(own['CHANGE'],), coefficients=cross_axis_coefficients),
         Effect(
             name=f'{short}_bias_drift', sensor=sensor, components=VECTOR + ('time_constant',), shape=(4,), unit=(unit, unit, unit, 's'),
             time_constant=True, smooth=True, against=('time',),
@@ -136,7 +137,7 @@ def _pair(sensor):
             prior_sd=(50 * small, 50 * small, 50 * small, 1000.0),
             plausible=(('consumer', 20 * MILLI_G if accel else 1 * DEG, 'field catalogue 6.1: warm-up of up to some mg over 1-15 min'),),
             motion=('warm_up',), compensation='none', groups=(own['WARM_UP'],),
-            coefficients=Amplitudes(f'{short}_bias_drift', own['WARM_UP'].name, time_constant=True)),
+            coefficients=amplitude_coefficients),
         Effect(
             name=f'{short}_saturation', sensor=sensor, role=Role.LIMIT, components=('level',), shape=(), unit=unit,
             explanation=f'The {sensor} output is clipped: it cannot follow inputs beyond its range.',
@@ -153,7 +154,7 @@ ACCELEROMETER = _pair('accelerometer') + (
         tolerance=MILLI_G / STANDARD_GRAVITY**3, tolerance_reason='1 mg at 1 g', prior_sd=100 * MILLI_G / STANDARD_GRAVITY**3,
         plausible=(('consumer', 1e-4 / STANDARD_GRAVITY**2, 'field catalogue 6.1: some 10 ug/g^3'),),
         motion=('centrifuge',), compensation='exact', groups=(base.CUBES['accelerometer'],),
-        coefficients=AlongAxis('accel_cubic', 'force_cubes', base.cube_coefficients)),
+        coefficients=partial(along_axis_coefficients, function=base.cube_coefficients)),
     Effect(
         name='accel_cross_product', sensor='accelerometer', components=PRODUCTS, shape=(3, 3), unit='(m/s^2)^-1', against=('force',),
         explanation='The accelerometers are pendulums that give way: '
@@ -161,21 +162,21 @@ ACCELEROMETER = _pair('accelerometer') + (
         tolerance=MILLI_G / STANDARD_GRAVITY**2, tolerance_reason='1 mg for 1 g on two axes', prior_sd=100 * MILLI_G / STANDARD_GRAVITY**2,
         plausible=(('consumer', 1e-3 / STANDARD_GRAVITY, 'Avrutov 2017, sample 2: 1 mV/g^2'),),
         motion=('static_dense',), compensation='exact', groups=(base.SQUARES['accelerometer'],),
-        coefficients=Products('accel_cross_product', 'force_squares')),
+        coefficients=product_coefficients),
     Effect(
         name='accel_size_effect', sensor='accelerometer', role=Role.ARMS, components=MATRIX, shape=(3, 3), unit='m',
         title='size effect: origin to the sensitive point of each axis',
         explanation='The three accelerometers sit at different points: each has a lever arm of its own (Zhang 2017, eq. 11-17).',
         tolerance=1e-3, tolerance_reason='1 mm, 0.1 m/s^2 at 10 rad/s', prior_sd=0.03,
         plausible=(('consumer', 0.03, 'field catalogue 6.1: 1-30 mm'),), motion=('oscillate_x', 'oscillate_y', 'oscillate_z'),
-        compensation='exact', needs=('rotation',), groups=(base.LEVER,), coefficients=LeverArms('accel_size_effect')),
+        compensation='exact', needs=('rotation',), groups=(base.LEVER,), coefficients=lever_coefficients),
     Effect(
         name='lever_arm', sensor='accelerometer', role=Role.ARM, components=VECTOR, shape=(3,), unit='m',
         title='lever arm of the triad (nuisance parameter)', in_reference=True, nuisance=True, contained_in='accel_size_effect',
         explanation='The whole accelerometer triad is displaced from its assumed point: one common lever arm.',
         tolerance=1e-3, tolerance_reason='the same arm, for the whole triad', prior_sd=0.5,
         plausible=(('consumer', 1.0, 'field catalogue 6.1: cm to dm'),), motion=('oscillate_x', 'oscillate_y', 'oscillate_z'),
-        compensation='none', needs=('rotation',), groups=(base.LEVER,), coefficients=LeverArms('lever_arm')),
+        compensation='none', needs=('rotation',), groups=(base.LEVER,), coefficients=lever_coefficients),
 )
 
 GYROSCOPE = _pair('gyroscope') + (
@@ -185,7 +186,7 @@ GYROSCOPE = _pair('gyroscope') + (
         explanation='The gyroscopes respond to specific force: their bias changes with attitude (g-sensitivity).',
         tolerance=0.01 * DEG / STANDARD_GRAVITY, tolerance_reason='0.01 deg/s at 1 g', prior_sd=1.0 * DEG / STANDARD_GRAVITY,
         plausible=(('consumer', 0.1 * DEG / STANDARD_GRAVITY, 'ADIS16460 data sheet: 0.01 deg/s/g'),), motion=('static_poses',),
-        compensation='exact', groups=(base.TRUE_INPUT['accelerometer'],), coefficients=Amplitudes('gyro_g_sensitivity', 'force')),
+        compensation='exact', groups=(base.TRUE_INPUT['accelerometer'],), coefficients=amplitude_coefficients),
     Effect(
         name='gyro_force_squared', sensor='gyroscope',
         components=tuple(f'{a}_{pair}' for a in AXES for pair in ('xx', 'yy', 'zz', 'xy', 'yz', 'xz')),
@@ -196,12 +197,12 @@ GYROSCOPE = _pair('gyroscope') + (
         plausible=(('consumer', 0.05 * DEG / STANDARD_GRAVITY**2, 'half of the g-sensitivity at 1 g'),),
         motion=('static_dense', 'centrifuge'),
         compensation='exact', groups=(base.SQUARES['accelerometer'],),
-        coefficients=Amplitudes('gyro_force_squared', 'force_squares')),
+        coefficients=amplitude_coefficients),
     Effect(
         name='gyro_rate_product', sensor='gyroscope', components=PRODUCTS, shape=(3, 3), unit='(rad/s)^-1', against=('rate',),
         explanation='Products of rate components enter the gyroscope output (Avrutov 2017, eq. 10).',
         tolerance=1e-3, tolerance_reason='as the matrix at 1 rad/s', prior_sd=0.3,
         plausible=(('consumer', 0.06, 'Avrutov 2017, sample 4: 1e-3 V/(deg/s)^2 at 0.1 V/(deg/s) is 0.6'),), motion=('two_axis',),
         compensation='exact', needs=('rotation',), groups=(base.SQUARES['gyroscope'],),
-        coefficients=Products('gyro_rate_product', 'rate_squares')),
+        coefficients=product_coefficients),
 )

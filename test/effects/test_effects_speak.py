@@ -272,7 +272,7 @@ def by_code(**changed):
     fields = {'name': 'mine', 'sensor': 'gyroscope', 'components': ('all',), 'shape': (1,), 'unit': '1', 'tolerance': 1.0, 'prior_sd': 1.0,
               'explanation': '',
               'motion': ('static_poses',), 'compensation': 'exact', 'groups': (ColumnGroup('mine', ('f_x * w_x',)),),
-              'coefficients': lambda values, point: {'mine': np.tile(values['mine'], 3)[None]}}
+              'coefficients': lambda effect, values, point: {'mine': np.tile(values['mine'], 3)[None]}}
     return Effect(**fields | changed)
 
 
@@ -289,7 +289,7 @@ def test_what_a_single_sample_does_not_tell_cannot_be_undone():
 
 
 def test_one_name_for_two_kinds_of_columns_is_refused():
-    clash = by_code(groups=(ColumnGroup('rate', ('f_x',)),), coefficients=lambda values, point: {'rate': np.tile(values['mine'], 3)[None]})
+    clash = by_code(groups=(ColumnGroup('rate', ('f_x',)),), coefficients=lambda effect, values, point: {'rate': np.tile(values['mine'], 3)[None]})
     model = SensorModel(catalogue=CATALOGUE.with_effects(clash)).with_effect('gyroscope', 'mine')
     with refused(InputError, 'column_name_taken', 'rate'):
         model.layout('gyroscope')
