@@ -9,6 +9,7 @@ import numpy as np
 from imu_calibration.compensation.compensate import FittedErrors, Transfer
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY, unit_of_rest
+from imu_calibration.kinematics.rotations import EARTH_RATE
 
 BLOCK = 0.25
 """s; means over it are steady at rest even where a motor shakes the robot."""
@@ -134,8 +135,6 @@ def _mean_of(blocks):
     return share @ [mean for *_, mean, _ in blocks], np.sqrt(share @ [variance for *_, variance in blocks]), int(number.sum())
 
 
-EARTH_RATE = 7.292e-5
-"""rad/s; a gyroscope at rest measures it about axes that are unknown here."""
 MOST_MOVED = 0.02
 """rad/s, 1.1 deg/s: a calibrated bias that has moved farther is a slow turn, or a broken sensor."""
 
@@ -189,7 +188,7 @@ class GyroBiasUpdate:
             return False
         if start != self._stop:
             self._stop, self._before, self.n_stops = start, self._now, self.n_stops + 1
-        variance = variance + EARTH_RATE**2 / 3
+        variance = variance + EARTH_RATE**2 / 3   # about axes that are unknown here
         bias, spread, seen, weight = self._before.after(now, self._time)
         seen, weight = seen + rate**2, weight + 1
         stationary = np.maximum(self._before.stationary, seen / weight)
