@@ -176,7 +176,9 @@ def add_claims(section, what, outcomes):
              sum(each.decision == 'unproven' for each in better), len(better), lambda s: s <= 0.25)):
         section.claim(claim, target, interval(count, total), holds(count / max(total, 1)), True)
     exceptions = [each for each in outcomes if (each.decision == 'helps') != (each.ratio < 1) and not np.isnan(each.ratio)]
-    section.say('; '.join(f'{each.case}: {each.sensor} {each.decision}, {each.ratio:.2f}' for each in exceptions) or 'No exceptions.')
+    if exceptions:
+        section.table(('exception', 'sensor', 'decision', 'error after / before'),
+                      [(each.case, each.sensor, each.decision, f'{each.ratio:.2f}') for each in exceptions])
 
 
 def run(folder, plots):
