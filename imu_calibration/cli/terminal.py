@@ -76,6 +76,8 @@ class Terminal:
             Spaces between columns.
 
         """
+        if not rows:
+            return []
         cells = [[cell if isinstance(cell, tuple) else (cell, '') for cell in row] for row in rows]
         if not widths:
             widths = [max(len(text) for text, _ in column) for column in zip(*cells, strict=True)]

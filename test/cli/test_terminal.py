@@ -70,6 +70,10 @@ def test_names_keep_their_dots_where_the_table_fits(width, name):
     assert name.split()[-1] in out.getvalue() and ('accelerometer.bias.x' in out.getvalue()) == (width == 120)
 
 
+def test_a_table_without_rows_has_no_lines():
+    assert Terminal(io.StringIO(), 80).table([]) == []
+
+
 class Screen(io.StringIO):
     """Standard error on a terminal."""
 
