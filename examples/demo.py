@@ -11,7 +11,8 @@ from pathlib import Path
 from error_figures import before_and_after
 
 from imu_calibration.cli.main import main
-from imu_calibration.cli.show import console
+from imu_calibration.cli.show import show_table
+from imu_calibration.cli.terminal import Terminal
 from imu_calibration.compensation import stream
 from imu_calibration.core.units import error_text, significant
 from imu_calibration.document import files
@@ -45,14 +46,11 @@ def run(folder):
 
 def show(figures):
     """Print the table of errors on the other session."""
-    from rich.table import Table
-    table = Table(title='Errors on a different session of the same IMU', title_justify='left', box=None, pad_edge=False)
-    for heading in ('', 'accelerometer', 'gyroscope', 'velocity after 50 s', 'position after 50 s'):
-        table.add_column(heading, justify='left' if not heading else 'right')
-    for name, f in zip(('before', 'after'), figures):
-        table.add_row(name, error_text(f.force, 'm/s^2'), error_text(f.rate, 'rad/s'), f'{significant(f.velocity)} m/s', f'{significant(f.position)} m')
-    print()
-    console().print(table)
+    numbers = ('accelerometer', 'gyroscope', 'velocity after 50 s', 'position after 50 s')
+    rows = [(name, error_text(f.force, 'm/s^2'), error_text(f.rate, 'rad/s'), f'{significant(f.velocity)} m/s', f'{significant(f.position)} m')
+            for name, f in zip(('before', 'after'), figures)]
+    print('\nErrors on a different session of the same IMU')
+    show_table(Terminal.standard(), ('', *numbers), rows, numbers=numbers)
 
 
 if __name__ == '__main__':
