@@ -4,7 +4,7 @@ The closed loop as processes over real DDS: a simulated table, calibration_node,
 An uncalibrated IMU with a fault outside its model is turned through its six faces. This motion determines every parameter of the model, but at +-1 g a
 quadratic term and an asymmetry of the scale factor are collinear, so the diagnosis reports a class of effects. The planner drives the motion that separates
 them until one effect remains. The live calibration then includes this effect, and the compensator corrects another motion with it. Run:
-``python examples/live_demo.py`` (or ``make live-demo``); it needs less than two minutes and no ``ros2 launch``, and writes ``live_demo.png``.
+``python examples/live_demo.py`` (or ``make live-demo``); it needs two to three minutes and no ``ros2 launch``, and writes ``live_demo.png``.
 """
 
 import argparse
@@ -119,7 +119,7 @@ def run(domain_id, folder, output):
     with NodeProcesses(domain_id) as processes:
         print(f'ROS_DOMAIN_ID {domain_id}: starting calibration_node, simulator_node and planner_node; hidden effect of the IMU: {HIDDEN}', flush=True)
         calibration_node = processes.start('calibration_node', {'table_file': TABLE, 'save_file': folder / 'live.yaml', 'diagnosis_period': 3600.0})
-        planner = processes.start('planner_node', {'table_file': TABLE, 'time_limit': 300.0, 'first_speed': 0.6, 'stall_patience': 15.0, 'silence': 5.0})
+        planner = processes.start('planner_node', {'table_file': TABLE, 'time_limit': 900.0, 'first_speed': 0.6, 'stall_patience': 15.0, 'silence': 5.0})
         watcher = Watcher(processes)
         simulator = processes.start('simulator_node', {**SIMULATOR, 'profile': PROFILE, 'start_time': START, 'wait_for_subscribers': 2})
         try:
