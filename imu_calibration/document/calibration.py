@@ -139,7 +139,6 @@ class Calibration:
         nuisances = set(np.array(self.param_names)[~self.model.requested])
         return {name: status for name, status in self.status_by_name.items() if name not in nuisances and status != FIXED}
 
-
     def compensate(self, samples: ImuSamples | np.ndarray, rate_s: np.ndarray | None = None, *, time: np.ndarray | None = None,
                    temperature_c: Any = None) -> ImuSamples | tuple[np.ndarray, np.ndarray]:
         """

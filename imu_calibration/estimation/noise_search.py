@@ -185,11 +185,11 @@ class NoiseLikelihood:
             within = means_beside_middles(processes, self._durations)[:, None]
             self._losses[key] = self._likelihood.whitened(self._white + within + offset**2, processes, step**2)
         logs, normal = self._losses[key]
-        asked = (key, None if used is None else tuple(used))
-        if asked not in self._profiles:
+        choice = (key, None if used is None else tuple(used))
+        if choice not in self._profiles:
             at = np.arange(len(normal)) if used is None else np.r_[used, len(normal) - 1]
-            self._profiles[asked] = logs + profile(normal[np.ix_(at, at)])
-        return self._profiles[asked]
+            self._profiles[choice] = logs + profile(normal[np.ix_(at, at)])
+        return self._profiles[choice]
 
     def of_axis(self, axis: int, shape: tuple) -> 'NoiseLikelihood':
         """Return the likelihood of the noise of one axis, the other axes fixed at the shape; in units of the axis' own typical noise."""

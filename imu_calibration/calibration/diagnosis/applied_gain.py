@@ -43,8 +43,8 @@ def gain_of_findings(found: Investigation, table: Table, before: Sequence[Questi
         Sensors that the difference acts on.
 
     """
-    attempt, applied = found.attempt, [[question for question in some if question in found.adopted] for some in (before, after)]
-    if not any(question.effect.compensation == 'exact' for question in applied[1] if question not in applied[0]):
+    attempt, applied = found.attempt, _compensated(found, before, after)
+    if applied is None:
         return heldout_gain(attempt, before, after, sensors=sensors)
     chosen = gain_in_turn(attempt, *applied, sensors=sensors)
     sides, sums = [applied_parameters(found, some) for some in applied], DistanceSums()
@@ -54,6 +54,13 @@ def gain_of_findings(found: Investigation, table: Table, before: Sequence[Questi
         for window, *residuals in zip(group, *(_errors(group, table, *side) for side in sides)):
             sums.add(window, residuals, attempt.noise)
     return sums.gains(chosen.sensor, APPLIED)[chosen.measure]
+
+
+def _compensated(found, before, after):
+    """Return the findings of two choices that belong into the model, or None if compensation corrects no additional one."""
+    sides = [[question for question in some if question in found.adopted] for some in (before, after)]
+    additional = [question for question in sides[1] if question not in sides[0]]
+    return sides if any(question.effect.compensation == 'exact' for question in additional) else None
 
 
 def applied_parameters(found: Investigation, chosen: Sequence[Question]) -> tuple[SensorModel, np.ndarray, np.ndarray]:
@@ -75,10 +82,11 @@ def gain_by_hand(found: HandInvestigation, before: Sequence[Question], *, after:
     The errors are those of `hand_proof.prove_by_hand` and, at rest, the corrected rate less that of the Earth about the vertical. Choice
     and estimate of each side exclude the poses; if no additional finding can be compensated, the residual is that of the model.
     """
-    applied = [[question for question in some if question in found.adopted] for some in (before, after)]
-    if not any(question.effect.compensation == 'exact' for question in applied[1] if question not in applied[0]):
+    applied = _compensated(found, before, after)
+    if applied is None:
         return found.gain(before, after, sensor)
     block, poses = found.clearest(applied[0], applied[1], sensor), found.baseline.poses
+    end = end_by_hand(poses)
     pair = [np.zeros((len(block.pose), 1 if block.duration is not None else block.known.shape[1])) for _ in applied]
     start = 0.0
     for out, named, smaller in found.held_out:
@@ -87,8 +95,8 @@ def gain_by_hand(found: HandInvestigation, before: Sequence[Question], *, after:
             names = {question.name for question in chosen}
             model, values, earth = found.extended(smaller, [question for question in named if question.name in names])
             moved = model.model.at(values)
-            start = max(start, judged_from_of(moved, end_by_hand(poses)))
-            values = applied_values(moved, values, uncorrected_in_time(moved, values, poses.time, end=end_by_hand(poses)).centre)
+            start = max(start, judged_from_of(moved, end))
+            values = applied_values(moved, values, uncorrected_in_time(moved, values, poses.time, end=end).centre)
             errors[rows] = _pose_errors(found, block, np.flatnonzero(rows), model, values, earth)
     return gain_of_poses(block.select(late := block.time >= start), [errors[late] for errors in pair], APPLIED)
 

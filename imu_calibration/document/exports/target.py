@@ -160,7 +160,7 @@ class Noise:
 
 
 STEPS = 30
-"""Fixed-point steps of the inversion: arms and g-sensitivity feel one another through small numbers."""
+"""Fixed-point steps of the inversion: arms and g-sensitivity couple both sensors by small numbers."""
 
 
 def inverted(imu: AffineImu, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
