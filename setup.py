@@ -1,4 +1,4 @@
-"""Installation by colcon (ament_python) and by pip; what runs where is explained in docs/decisions/packaging.md."""
+"""Installation by colcon (ament_python) and by pip; docs/decisions/packaging.md has the places of the files."""
 
 from glob import glob
 from pathlib import Path

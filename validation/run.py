@@ -1,4 +1,4 @@
-"""Run every section on the recordings and write docs/validation.md with its plots; exit code 1 when a section could not be run."""
+"""Run every section on the recordings and write docs/validation.md with its plots; exit code 1 if a section failed."""
 
 import argparse
 import importlib
@@ -24,7 +24,7 @@ PACKAGES = ('numpy', 'scipy', 'rosbags', 'imucal', 'python-ins')
 
 
 def versions():
-    """Return [(name, version)] of what took part."""
+    """Return [(name, version)] of the package, the system and the libraries."""
     found = [('imu_calibration', __version__), ('Python', platform.python_version()),
              ('system', f'{platform.system()} {platform.machine()}')]
     for name in PACKAGES:
@@ -36,7 +36,7 @@ def versions():
 
 
 def run_section(name, folder, plots):
-    """Return (Section, whether it ran to its end)."""
+    """Return (Section, whether it is complete)."""
     start = time.monotonic()
     print(f'{name} ...', end=' ', flush=True)
     try:
@@ -55,7 +55,7 @@ def run_section(name, folder, plots):
 
 
 def document(sections):
-    """Return the whole document."""
+    """Return the text of docs/validation.md."""
     head = text('introduction', date=date.today().isoformat(), versions='\n'.join(f'| {name} | {found} |' for name, found in versions()))
     rows = [row for section in sections for row in section.rows if row.holds is not None]
     missed = [row for row in rows if not row.holds]
@@ -75,7 +75,7 @@ def claims(sections):
 
 
 def main():
-    """Run, write, say where."""
+    """Run the sections and write the pages."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--only', action='append', choices=SECTIONS, help='run only this section and print it; may be repeated')
     parser.add_argument('--output', type=Path, default=ROOT / 'docs', help='folder for validation.md, claims.md and validation/, default docs')

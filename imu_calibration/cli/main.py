@@ -24,7 +24,6 @@ class ProgressBars:
     def __init__(self, *, verbose: bool = False):
         self._verbose, self._ended = verbose, threading.Event()
         self._bar: Any = None
-        self._total = 0.0
         self._phase, self._since = '', time.monotonic()
 
     def __enter__(self):
@@ -49,7 +48,7 @@ class ProgressBars:
             self._bar = tqdm(total=SWEEP, bar_format=RUNNING, leave=False, dynamic_ncols=True)
             self._refresher = threading.Thread(target=self._refresh, name='progress', daemon=True)
             self._refresher.start()
-        self._total, self._bar.total, self._bar.bar_format = total, total or SWEEP, SHARE if total else RUNNING
+        self._bar.total, self._bar.bar_format = total or SWEEP, SHARE if total else RUNNING
         if new:
             self._bar.set_description_str(phase, refresh=False)
             self._bar.reset()
@@ -58,7 +57,7 @@ class ProgressBars:
 
     def _refresh(self):
         while not self._ended.wait(REFRESH):
-            if not self._total:
+            if self._bar.bar_format == RUNNING:
                 self._bar.n = (self._bar.n + 1) % (SWEEP + 1)
             self._bar.refresh()
 

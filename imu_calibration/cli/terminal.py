@@ -1,4 +1,4 @@
-"""Text on standard output: lines break between words at the width of a terminal, with colours where they are wanted; a file has neither."""
+"""Text on standard output: lines break between words at the width of a terminal, with colours on a terminal; a file has neither."""
 
 import os
 import shutil
@@ -24,7 +24,7 @@ class Terminal:
     """A stream of text with a width."""
 
     stream: TextIO
-    """Where lines are written."""
+    """Output of the lines."""
     width: int
     """Characters of a line."""
     moves: bool = False
@@ -34,7 +34,7 @@ class Terminal:
 
     @classmethod
     def standard(cls) -> 'Terminal':
-        """Return that of standard output: colours on a terminal unless NO_COLOR is set (no-color.org)."""
+        """Return the terminal of standard output, with colours unless NO_COLOR is set (no-color.org)."""
         moves = sys.stdout.isatty()
         coloured = moves and not os.environ.get('NO_COLOR') and os.environ.get('TERM') != 'dumb'
         return cls(sys.stdout, shutil.get_terminal_size().columns if moves else UNLIMITED, moves, coloured)

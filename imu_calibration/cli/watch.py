@@ -60,6 +60,8 @@ def _watch(watcher, options):
     while time.monotonic() - watcher.heard < GONE:
         watcher.spin(PERIOD)
         drawn = out.redraw(watcher.screen(out), drawn)
+    if not out.moves:
+        out.write(watcher.screen(out))
     out.print(f'{watcher.name} has ended')
     return VerbResult(0, {'node': watcher.name})
 
