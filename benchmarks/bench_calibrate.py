@@ -1,15 +1,13 @@
 """
-Time and memory of ``imu_calibration calibrate`` on a long bag, relative to the iteration of rosbags over its raw messages.
+Processor time and memory of ``imu_calibration calibrate`` on a long bag, relative to the iteration of rosbags over its raw messages.
 
-Every repetition times both on the same bag one after the other, so that a busy machine slows both; the ratio is the median over the
-repetitions. The time of the command includes its imports. Run it separately with
+Every repetition times both on the same bag one after the other, so that a slow machine changes both; the ratio is the median over
+the repetitions. The time of the command includes its imports. Run it separately with
 ``python benchmarks/bench_calibrate.py [--minutes M] [--repetitions N]``.
 """
 
 import argparse
-import subprocess
 import sys
-import time
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -19,9 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
     sys.path.insert(0, str(ROOT))
 
-from rosbags.highlevel import AnyReader  # noqa: E402
-
-from benchmarks.bags import long_session, write_bench_bag  # noqa: E402
+from benchmarks.bags import iterate, long_session, run_verb, write_bench_bag  # noqa: E402
 from imu_calibration.use_cases.resources import config_file  # noqa: E402
 
 REPETITIONS = 5
@@ -31,16 +27,6 @@ LIMITS = {'mcap': 2.0, 'sqlite3': 4.0}
 GROWTH, GROWTH_LIMIT = 4.0, 4.4
 """Factor of the length, and the largest permitted factor of the time."""
 MEMORY_LIMIT_MB = 500.0
-
-
-RUNNER = '''
-import os, subprocess, sys, time
-start = time.perf_counter()
-child = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-_, status, usage = os.wait4(child.pid, 0)
-print(time.perf_counter() - start, usage.ru_maxrss, os.waitstatus_to_exitcode(status))
-'''
-"""Runs a command from a small process: the peak memory of a child begins with that of its parent."""
 
 
 class Row(NamedTuple):
@@ -81,24 +67,10 @@ def _measure(long_bag, short_bag, storage, limit, repetitions, output):
     ]
 
 
-def iterate(bag):
-    """Return the time of rosbags for all raw messages of a bag, s."""
-    start = time.perf_counter()
-    with AnyReader([bag]) as reader:
-        for _ in reader.messages():
-            pass
-    return time.perf_counter() - start
-
-
 def calibrate(bag, output):
-    """Return (seconds, peak memory in MB) of calibrating a bag in a process of its own."""
-    command = [sys.executable, '-m', 'imu_calibration', 'calibrate', str(bag), '--table', str(config_file('table_simulated.yaml')),
-               '--output', str(output), '--no-report']
-    found = subprocess.run([sys.executable, '-c', RUNNER, *command], cwd=ROOT, capture_output=True, text=True, check=True)
-    seconds, kilobytes, code = found.stdout.split()
-    if int(code) not in (0, 3):
-        raise RuntimeError(f'calibrate must end with 0 or 3, it ended with {code}; run it by hand: {" ".join(command)}')
-    return float(seconds), float(kilobytes) / 1024
+    """Return (processor seconds, peak memory in MB) of calibrating a bag without a report."""
+    return run_verb([sys.executable, '-m', 'imu_calibration', 'calibrate', str(bag), '--table', str(config_file('table_simulated.yaml')),
+                     '--output', str(output), '--no-report'])
 
 
 def main():
