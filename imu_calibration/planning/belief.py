@@ -64,22 +64,23 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
         return Relaxation(0.0, 0.0, weights)
     if _worst(known + LONGEST * np.sum(information / seconds[:, None, None], axis=0), asked) > 1.0:
         return Relaxation(np.nan, np.nan, weights)
-    kept = np.arange(len(seconds))
-    flat = information.reshape(len(seconds), -1)
-    share = np.full(len(seconds), 1.0 / len(seconds)) / seconds
+    flat = used = information.reshape(len(seconds), -1)
+    kept, root = np.arange(len(seconds)), np.linalg.cholesky(known)
+    rows = scipy.linalg.solve_triangular(root, asked.T, lower=True).T
+    share = 1.0 / len(seconds) / seconds
     best = Relaxation(0.0, np.inf, weights)
     for number in range(ROUNDS):
-        total, scale = _scaled(np.tensordot(share[kept], flat[kept], 1).reshape(known.shape), known, asked)
-        covariance = inverse_normal(total)   # nearly singular in unreachable directions
+        direction = np.tensordot(share[kept], used, 1).reshape(known.shape)
+        scale = _scale(direction, root, rows)
+        covariance = inverse_normal(known + scale * direction)   # nearly singular in unreachable directions
         x = covariance @ asked.T
         variance = np.einsum('pn,np->p', asked, x)
         prices = (x * weights) @ x.T
         worth = np.zeros(len(seconds))
-        full = number % 25 == 0 or number == ROUNDS - 1
-        used = np.arange(len(seconds)) if full else kept
-        worth[used] = flat[used] @ prices.ravel() / seconds[used]
+        worth[kept] = used @ prices.ravel() / seconds[kept]
         relaxed = scale * float(share @ seconds)
-        if full:
+        if number % 25 == 0 or number == ROUNDS - 1:
+            worth = flat @ prices.ravel() / seconds
             factor = 1.0 / worth.max()
             bound = factor * (weights @ (2 * variance - 1) - np.sum(known * prices))
             if bound > best.seconds:
@@ -87,11 +88,10 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
             if relaxed < CLOSE * best.seconds:
                 break
             kept = np.flatnonzero((worth > 0.3 * worth.max()) | (share * seconds > 1e-4 * (share @ seconds)))
+            used = flat[kept]
         spent = share[kept] * seconds[kept]
         share[kept] *= np.sqrt(np.maximum(worth[kept], 1e-12) / (worth[kept] @ spent / spent.sum()))
-        mask = np.zeros(len(share), bool)
-        mask[kept] = True
-        share = np.where(mask, share, 0.0 if number > 50 else share)
+        share = np.where(np.isin(np.arange(len(share)), kept) | (number <= 50), share, 0.0)
         weights = weights * variance / variance.max()
         weights /= weights.sum()
     return best
@@ -101,18 +101,17 @@ def _worst(information, asked):
     return float(np.einsum('pn,pn->p', asked @ np.linalg.inv(information), asked).max())
 
 
-def _scaled(direction, known, asked):
-    """Return the information with so much of `direction` that the worst parameter just meets its tolerance, and how much that is."""
-    root = np.linalg.cholesky(known)
+def _scale(direction, root, rows):
+    """Return how much of `direction` the information ``root @ root.T`` needs for the worst of `rows`, in its units, to meet its tolerance."""
     inner = scipy.linalg.solve_triangular(root, scipy.linalg.solve_triangular(root, direction, lower=True).T, lower=True)
     values, vectors = scipy.linalg.eigh(0.5 * (inner + inner.T))
-    squares = (scipy.linalg.solve_triangular(root, asked.T, lower=True).T @ vectors)**2
+    squares = (rows @ vectors)**2
     low, high = -30.0, 60.0
     while high - low > 1e-4:
         middle = 0.5 * (low + high)
         enough = (squares / (1 + np.exp(middle) * np.maximum(values, 0.0))).sum(axis=1).max() <= 1.0
         low, high = (low, middle) if enough else (middle, high)
-    return known + np.exp(high) * direction, float(np.exp(high))
+    return float(np.exp(high))
 
 
 SAMPLING = 16.0
@@ -298,7 +297,8 @@ class Belief:
         ndarray, shape (k, m, m)
 
         """
-        return np.linalg.inv(np.linalg.inv(self._forgotten(0.5 * (self._last + seconds))) + information)
+        steps, motion = np.unique(0.5 * (self._last + seconds), return_inverse=True)   # many motions last equally long
+        return np.linalg.inv(np.linalg.inv(self._forgotten(steps))[motion] + information)
 
     def take(self, information: np.ndarray, seconds: float) -> None:
         """Advance by a chosen motion."""
