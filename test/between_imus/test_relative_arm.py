@@ -126,7 +126,7 @@ def test_sd_are_honest():
         scores.append((found.arm - ARM) / found.diagnostics['motion_sd'])
         assert not found.diagnostics['calibrated'] and np.all(found.diagnostics['calibration_sd'] > np.zeros(3))
     print(f'mean square z {np.mean(np.square(scores)):.2f}, 95 % intervals hold {100 * np.mean(np.abs(scores) < 1.96):.1f} %')
-    assert 0.65 < np.mean(np.square(scores)) < 1.5
+    assert 0.75 < np.mean(np.square(scores)) < 1.5   # 1.15 for these seeds: an sd wrong by a factor of 1.3 gives 0.68 or 1.95
 
 
 @pytest.mark.slow

@@ -57,16 +57,20 @@ def test_a_wrong_gain_at_high_frequency_does_not_bend_the_estimate(fast_gain):
 
 
 def test_nothing_is_thrown_away_where_the_reference_is_right():
-    """The standard deviation is that of all samples, and its scatter is as it says."""
+    """
+    The standard deviation is that of all samples, and estimates scatter by it.
+
+    The mean square of 50 errors in sd scatters by 0.2; the bounds exclude an sd that is wrong by a factor of 1.3, in either direction, for this seed.
+    """
     rng, errors = np.random.default_rng(2), []
-    for _ in range(20):
+    for _ in range(50):
         windows = sweeps(rng, GAIN, n_windows=6, length=400)
         value, sd, noise = solved(windows)
         assert np.all(noise.slow_weight('dynamic') == 0.0)
         errors.append((value - GAIN) / sd)
     power = sum(((w.motion.rate[:, 0] - w.motion.rate[:, 0].mean())**2).sum() for w in windows)
     assert 0.95 < sd * np.sqrt(power) / NOISE < 1.1
-    assert 0.3 < np.mean(np.square(errors)) < 2.2
+    assert 0.6 < np.mean(np.square(errors)) < 1.6
 
 
 def test_white_noise_has_the_same_variance_in_both_parts():
