@@ -102,7 +102,7 @@ def _worst(information, asked):
 
 
 def _scale(direction, root, rows):
-    """Return how much of `direction` the information ``root @ root.T`` needs for the worst of `rows`, in its units, to meet its tolerance."""
+    """Return how much of `direction` must be added to ``root @ root.T`` for the worst parameter to meet its tolerance."""
     inner = scipy.linalg.solve_triangular(root, scipy.linalg.solve_triangular(root, direction, lower=True).T, lower=True)
     values, vectors = scipy.linalg.eigh(0.5 * (inner + inner.T))
     squares = (rows @ vectors)**2
