@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import toeplitz
 
 from imu_calibration.allan.figures import HORIZON, SLOW, AxisFigures, NoiseFigures, TrendFigure
 from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, NoiseProcess, mean_covariance
@@ -200,8 +201,8 @@ def position_sd(processes: Sequence[NoiseProcess], coefficients: Sequence[float]
     until_end = (after - np.arange(after) - 0.5) * step
     weights = until_end * step if sensor == 'accelerometer' else 0.5 * gravity * until_end**2 * step
     weights = np.concatenate([np.full(before, -weights.sum() / before), weights])
-    lag = (np.arange(before + after)[:, None] - np.arange(before + after)[None, :]) * step
-    variances = [weights @ mean_covariance(process, lag, step) @ weights for process in processes]
+    lag = np.arange(before + after) * step
+    variances = [weights @ toeplitz(mean_covariance(process, lag, step)) @ weights for process in processes]
     return np.sqrt(np.maximum(np.array(variances), 0.0) * np.asarray(coefficients, float))
 
 

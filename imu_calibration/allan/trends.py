@@ -72,6 +72,11 @@ def shape_of(name: str, constant: float = 0.0) -> Callable:
             RAMP: lambda time, warmth, reference: time - reference.middle}[name]
 
 
+def _log_determinants(triangles):
+    """Return the logarithms of the determinants of ``T.T @ T``, for triangular T of shape (k, n, n)."""
+    return 2 * np.log(np.abs(np.diagonal(triangles, axis1=1, axis2=2))).sum(axis=1)
+
+
 class TrendSearch:
     """
     Finds trends in the means of blocks.
@@ -93,19 +98,15 @@ class TrendSearch:
         self._lag = lag
         centred = self._walk - self._walk.mean(axis=0) - self._walk.mean(axis=1)[:, None] + self._walk.mean()
         self._scale = float(np.trace(centred)) / len(lag)
-        self._whiteners = [self._whitener(ratio) for ratio in RATIOS]
+        # Unit white noise and a random walk for each ratio, in a form that needs no variance of the walk.
+        centred = self._walk - self._walk[:1] - self._walk[:, :1] + self._walk[0, 0]
+        factors = np.linalg.cholesky(np.eye(len(lag)) + RATIOS[:, None, None] / self._scale * centred)
+        self._inverses, self._logs = np.linalg.inv(factors), _log_determinants(factors)
 
     @property
     def usable(self) -> bool:
         """Whether there are enough blocks."""
         return len(self.blocks.time) - self._constants.shape[1] >= LEAST_BLOCKS
-
-    def _whitener(self, ratio):
-        """Return (inverse factor, log determinant) of unit white noise and a random walk, in a form that needs no variance of the walk."""
-        centred = self._walk - self._walk[:1] - self._walk[:, :1] + self._walk[0, 0]
-        covariance = np.eye(len(centred)) + ratio / self._scale * centred
-        factor = np.linalg.cholesky(covariance)
-        return np.linalg.inv(factor), 2 * np.log(np.diag(factor)).sum()
 
     def find(self, axis: int) -> tuple[AxisTrend, ...]:
         """Return the trends of an axis (0 to 5), the temperature first; none of one that never changes."""
@@ -148,20 +149,15 @@ class TrendSearch:
         """Return coefficients, their standard deviations, and the index of the likeliest ratio of `RATIOS`."""
         design, target = np.column_stack([self._constants, self.columns(trends)]), self.blocks.mean[:, axis]
         size = np.linalg.norm(design, axis=0)
-        fits = []
-        for inverse, logs in self._whiteners:
-            basis, triangle = np.linalg.qr(inverse @ (design / size))
-            rest = inverse @ target
-            along = basis.T @ rest
-            # The residual of an axis with constant readings is a rounding error.
-            squares = max(float(rest @ rest - along @ along), np.finfo(float).eps * float(rest @ rest), np.finfo(float).tiny)
-            freedom = len(target) - design.shape[1]
-            cost = logs + 2 * np.log(np.abs(np.diag(triangle))).sum() + freedom * np.log(squares)
-            fits.append((cost, triangle, along, squares / freedom))
-        best = int(np.argmin([fit[0] for fit in fits]))
-        _, triangle, along, variance = fits[best]
-        root = np.linalg.inv(triangle)
-        values, sd = root @ along / size, np.sqrt(variance * np.einsum('ij,ij->i', root, root)) / size
+        basis, triangle = np.linalg.qr(self._inverses @ (design / size))
+        rest = self._inverses @ target
+        along = np.einsum('rnk,rn->rk', basis, rest)
+        total, freedom = np.sum(rest**2, axis=1), len(target) - design.shape[1]
+        # The residual of an axis with constant readings is a rounding error.
+        squares = np.maximum(total - np.sum(along**2, axis=1), np.finfo(float).eps * total + np.finfo(float).tiny)
+        best = int(np.argmin(self._logs + _log_determinants(triangle) + freedom * np.log(squares)))
+        root = np.linalg.inv(triangle[best])
+        values, sd = root @ along[best] / size, np.sqrt(squares[best] / freedom * np.einsum('ij,ij->i', root, root)) / size
         return values[-len(trends):], sd[-len(trends):], best
 
     def kept(self, axis: int, trends: tuple[AxisTrend, ...]) -> 'KeptShare':
@@ -169,7 +165,7 @@ class TrendSearch:
         if not trends:
             return KeptShare()
         shapes = [(trend.name, trend.time) for trend in trends]
-        inverse = self._whiteners[self.regress(axis, shapes)[2]][0]
+        inverse = self._inverses[self.regress(axis, shapes)[2]]
         design = np.column_stack([self._constants, self.columns(shapes)])
         whitened = inverse @ design
         taken = np.eye(len(design)) - design @ np.linalg.pinv(whitened) @ inverse
