@@ -26,7 +26,7 @@ from imu_calibration.allan.processes import (  # noqa: E402
     gauss_markov,
     mean_covariance,
 )
-from imu_calibration.allan.terms import PROCESSES, TIME, fit_form, identify_axis  # noqa: E402  # noqa: E402
+from imu_calibration.allan.terms import PROCESSES, TIME_KEY, fit_form, identify_axis  # noqa: E402  # noqa: E402
 from imu_calibration.effects.base import SENSORS  # noqa: E402
 from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402
 
@@ -34,7 +34,7 @@ from worlds.noise_worlds import FORMS, RATE, draw_truth  # noqa: E402
 
 LENGTHS = {'10 min': 600.0, '1 h': 3600.0, '3 h': 10800.0}
 NAMES = {'white_noise': 'white noise N', 'random_walk': 'random walk K', 'bias_instability': 'bias instability B', 'gauss_markov': 'Gauss–Markov σ',
-         TIME: 'correlation time τ', 'quantisation': 'quantisation Q'}
+         TIME_KEY: 'correlation time τ', 'quantisation': 'quantisation Q'}
 BLOCKS = 500
 """Blocks of the Fisher information."""
 BEGIN, END = '<!-- records: begin -->', '<!-- records: end -->'
@@ -77,7 +77,7 @@ def judged(truth, moments):
     fit = fit_form(moments, truth.form, tuple(name for name in names if name == 'quantisation')).fit
     true, values = coefficients(truth, names), dict(zip(names, fit.coefficients))
     if 'gauss_markov' in names:
-        values[TIME] = fit.processes[-1].time
+        values[TIME_KEY] = fit.processes[-1].time
     bounds, of_moments = bound(moments, truth, names), moment_bound(moments, truth, names)
     errors = [(name, float(values[name] / true[name] - 1), bounds[name], of_moments[name]) for name in true]
     return {'true': list(truth.form), 'found': list(found.form), 'rivals': [list(form) for form in found.others], 'figures': figures, 'errors': errors}
@@ -87,7 +87,7 @@ def coefficients(truth, names):
     """Return the true coefficients, and the correlation time."""
     true = {name: truth.figures[name]**2 for name in names}
     if 'gauss_markov' in names:
-        true[TIME] = truth.figures[TIME]
+        true[TIME_KEY] = truth.figures[TIME_KEY]
     return true
 
 
@@ -107,27 +107,27 @@ def bound(moments, truth, names):
     shares = np.array(spectra) / sum(spectra[:len(names)])
     information += shares @ shares.T
     sd = np.sqrt(np.diag(np.linalg.inv(information)))
-    return {name: float(value) for name, value in zip([*names, *([TIME] if 'gauss_markov' in names else [])], sd)}
+    return {name: float(value) for name, value in zip([*names, *([TIME_KEY] if 'gauss_markov' in names else [])], sd)}
 
 
 def moment_bound(moments, truth, names):
     """Return the relative bounds of the optimally weighted estimator from Allan variances (GMWM's bound)."""
     design = np.column_stack(_derivatives(truth, names, moments.scales.expectation))
-    processes = tuple(gauss_markov(truth.figures[TIME]) if name == 'gauss_markov' else PROCESSES[name] for name in names)
+    processes = tuple(gauss_markov(truth.figures[TIME_KEY]) if name == 'gauss_markov' else PROCESSES[name] for name in names)
     squares = np.array([truth.figures[name]**2 for name in names])
     columns = Whitener(np.einsum('p,q,pqij->ij', squares, squares, moments.scales.tensor(processes)))(design)
     sd = np.sqrt(np.diag(np.linalg.inv(columns.T @ columns)))
-    return {name: float(value) for name, value in zip([*names, *([TIME] if 'gauss_markov' in names else [])], sd)}
+    return {name: float(value) for name, value in zip([*names, *([TIME_KEY] if 'gauss_markov' in names else [])], sd)}
 
 
 def _derivatives(truth, names, of):
     """Return the contribution of each process, and the change with the logarithm of the correlation time."""
     parts = []
     for name in names:
-        process = gauss_markov(truth.figures[TIME]) if name == 'gauss_markov' else PROCESSES[name]
+        process = gauss_markov(truth.figures[TIME_KEY]) if name == 'gauss_markov' else PROCESSES[name]
         parts.append(truth.figures[name]**2 * of(process))
     if 'gauss_markov' in names:
-        time, step = truth.figures[TIME], 0.01
+        time, step = truth.figures[TIME_KEY], 0.01
         parts.append(truth.figures['gauss_markov']**2 * (of(gauss_markov(time * (1 + step))) - of(gauss_markov(time * (1 - step)))) / (2 * step))
     return parts
 

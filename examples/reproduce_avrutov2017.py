@@ -48,7 +48,7 @@ def print_samples():
         print(f'\nSample {number}: {title}, {len(inputs)} runs, cond {solution.cond:.6g}, eqcond {solution.eqcond:.5g}')
         print(f'  largest error: ours {np.max(np.abs(solution.values - truth)):.1e}, printed normal equations {normal:.1e}')
         print(f'  {"":5s}{"printed":>27s}{"ours":>32s}{"nominal":>29s}')
-        for k, name in enumerate(avrutov.COLUMNS[model]):
+        for k, name in enumerate(avrutov.MODEL_COLUMNS[model]):
             printed = ''.join(f'{v:10.6f}' for v in PRINTED[number][k]) if k < len(PRINTED[number]) else f'{"(not in the text)":>30s}'
             print(f'  {name:5s}{printed}  {"".join(f"{v:10.6f}" for v in solution.values[k])} {"".join(f"{v:9.4f}" for v in truth[k])}')
 
@@ -84,7 +84,7 @@ def print_refusals():
             avrutov.calibrate(inputs, np.zeros((len(inputs), 3)), model)
             raise SystemExit(f'{name} should have been refused')
         except NotObservableError:
-            lost = sorted(set().union(*null_directions(design, avrutov.COLUMNS[model])))
+            lost = sorted(set().union(*null_directions(design, avrutov.MODEL_COLUMNS[model])))
             print(f'{name:40s} rank {numerical_rank(design)} of {design.shape[1]}; not determined: {", ".join(lost)}')
 
 
@@ -95,7 +95,7 @@ def print_gyro_series():
         unit_sd = avrutov.calibrate(inputs, np.zeros((len(inputs), 3)), model).unit_sd
         percent = 100 * 1e-3 * unit_sd / np.abs(truth[:, 0])
         eqcond = condition_numbers(avrutov.design_matrix(inputs, model))[1]
-        print(f'{title:36s} eqcond {eqcond:7.1f}  ' + '  '.join(f'{n} {p:.3g}' for n, p in zip(avrutov.COLUMNS[model], percent)))
+        print(f'{title:36s} eqcond {eqcond:7.1f}  ' + '  '.join(f'{n} {p:.3g}' for n, p in zip(avrutov.MODEL_COLUMNS[model], percent)))
 
 
 def print_budget():
@@ -105,7 +105,7 @@ def print_budget():
         readings(), truth, 'linear', noise_sd=1e-4, common={'levelling': avrutov_budget.tilt_changes(mat_bn, 'z', TILT)},
         scattered={'encoder': avrutov_budget.encoder_changes('ZYX', np.tile(ANGLES, (3, 1)), 'z', encoder_sd_rad=ENCODER)})
     for cause, sd in budget.items():
-        print(f'{cause:14s}' + ''.join(f'   {name} {1e3 * np.max(row):.4f}' for name, row in zip(avrutov.COLUMNS['linear'], sd)))
+        print(f'{cause:14s}' + ''.join(f'   {name} {1e3 * np.max(row):.4f}' for name, row in zip(avrutov.MODEL_COLUMNS['linear'], sd)))
     tilted = avrutov.design_matrix(avrutov.gravity_readings(mat_bn, 'z', (TILT, 0))) @ truth
     solution = avrutov_budget.calibrate_with_tilt(mat_bn, tilted, 'z')
     print(f'levelling estimated with the three sensors jointly: rank {solution.linear.rank} of 14, '
@@ -121,7 +121,7 @@ def print_section_5():
     rows = {'1/(m-1), printed': avrutov_budget.m_test_sd(errors), '1/m': avrutov_budget.m_test_sd(errors, as_printed=False),
             "sigma sqrt(diag BB')": np.repeat(noise_sd * np.linalg.norm(operator, axis=1)[:, None], 3, axis=1)}
     for title, sd in rows.items():
-        print(f'{title:22s}' + ''.join(f'   {name}{"".join(f"{1e3 * one:8.4f}" for one in row)}' for name, row in zip(avrutov.COLUMNS['linear'], sd)))
+        print(f'{title:22s}' + ''.join(f'   {name}{"".join(f"{1e3 * one:8.4f}" for one in row)}' for name, row in zip(avrutov.MODEL_COLUMNS['linear'], sd)))
     few = avrutov_budget.m_test_sd(errors[:5]) / avrutov_budget.m_test_sd(errors[:5], as_printed=False)
     print(f'B is {operator.shape[0]} x {operator.shape[1]}, not n x 4; with five tests 1/(m-1) is {100 * (few.mean() - 1):.0f} % too large, for the truth is '
           'known and no mean was estimated')

@@ -29,7 +29,7 @@ DESCRIPTION_TOPIC = '/robot_description'
 STRING_TYPE = 'std_msgs/msg/String'
 STATIC_TOPIC = '/tf_static'
 TF_TYPE = 'tf2_msgs/msg/TFMessage'
-T = TypeVar('T')
+Sample = TypeVar('Sample')
 
 
 def frame_of(path: str, imu_topic: str | None = None) -> str:
@@ -69,7 +69,7 @@ def transform_rows(message: Any) -> list[tuple[str, str, np.ndarray]]:
              np.array([float(getattr(t.transform.rotation, a)) for a in 'xyzw'])) for t in message.transforms]
 
 
-def _messages(path, imu_topic, topic, message_type, read: Callable[[Any], T]) -> Iterator[T]:
+def _messages(path, imu_topic, topic, message_type, read: Callable[[Any], Sample]) -> Iterator[Sample]:
     """Yield the result of `read` for each decodable message of a topic; no results when the recording lacks it."""
     with open_recording(path, imu_topic, want_joints=False, want_temperature=False) as recording:
         if recording.source.types.get(topic) == message_type:
@@ -81,7 +81,7 @@ def _messages(path, imu_topic, topic, message_type, read: Callable[[Any], T]) ->
                         yield read(deserialize(packed.message(k)))
 
 
-KEYS = {IMU_TYPE: 'imu_topic', JOINT_STATE_TYPE: 'joint_topic', TEMPERATURE_TYPE: 'temperature_topic'}
+TOPIC_KEYS = {IMU_TYPE: 'imu_topic', JOINT_STATE_TYPE: 'joint_topic', TEMPERATURE_TYPE: 'temperature_topic'}
 """Key in errors for the choice of a topic."""
 
 BLOCK_SAMPLES = 65536
@@ -304,7 +304,7 @@ def _listed(source):
 
 def _choose(path, topics, message_type, asked, required, lenient=False):
     """Return the topic of a type by the rule of `open_recording`, or None: where there is none, or, when `lenient`, no telling which."""
-    key = KEYS[message_type]
+    key = TOPIC_KEYS[message_type]
     fitting = [topic.name for topic in topics if topic.type == message_type]
     if asked is not None:
         names = [name for name in (asked, '/' + asked.lstrip('/')) if name in fitting]
@@ -331,7 +331,7 @@ def _listing(topics, fitting):
     return 'it holds ' + (', '.join(f'{topic.name} ({topic.type})' for topic in topics) or 'no topics')
 
 
-STRETCH = 8192
+STRETCH_MESSAGES = 8192
 """Messages per stretch."""
 
 
@@ -378,7 +378,7 @@ class Ros1File:
                 break
             pending[self.topics[connection.id]].append((bytes(data), received_ns))
             n_pending, n_read = n_pending + 1, n_read + 1
-            if n_pending == STRETCH:
+            if n_pending == STRETCH_MESSAGES:
                 yield _arrived(pending)
                 pending, n_pending = defaultdict(list), 0
         if pending:

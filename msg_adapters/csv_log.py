@@ -28,7 +28,7 @@ from msg_adapters.write import write_session
 SUFFIXES = ('.csv', '.tsv', '.txt')
 HEAD_BYTES = 1 << 16
 """Bytes in which header, delimiter and first rows are found."""
-UNITS = {
+COLUMN_UNITS = {
     'time': {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9},
     'force': {'m/s^2': 1.0, 'g': STANDARD_GRAVITY, 'mg': 1e-3 * STANDARD_GRAVITY},
     'rate': {'rad/s': 1.0, 'deg/s': DEG, 'mdeg/s': 1e-3 * DEG},
@@ -46,7 +46,7 @@ SPELLINGS = {
     'joint': {'rads': 'rad', '°': 'deg', 'degrees': 'deg', 'radians': 'rad'},
 }
 """Quantity -> spelling in headers -> unit."""
-NAMES = (
+COLUMN_PATTERNS = (
     ('time', r'((logging|sensor|device|imu|sample) ?)?time|timestamp|t|epoch|seconds|sec|time ?stamp.*|(.* )?stamp|.*elapsed'),
     ('force', r'(a|acc|accel|accelerometer|acceleration|f|specific force|a rs s|(accelerometer|acc|raw|imu|total) ?accel\w*|'
      r'(.* )?linear acceleration)'),
@@ -57,7 +57,7 @@ NAMES = (
 """Quantity -> names of its columns, in lower case, without axis and unit; an axis follows for force and rate."""
 PERIODS = (('s', 1.25e-4, 0.11), ('ms', 0.12, 110.0), ('us', 120.0, 1.1e5), ('ns', 1.2e5, 1.1e8))
 """Unit of time -> range of the median step for rates of 9 to 8000 Hz; the ranges do not overlap within the usual rates."""
-LONGEST = 4e9
+MAX_TIME_SECONDS = 4e9
 """s; stamps in ns and their differences fit into 64 bits."""
 GRAVITY_BAND = 1.15
 """The median of the specific force may differ from gravity by this factor."""
@@ -71,7 +71,7 @@ class Columns:
     """The columns of one quantity."""
 
     quantity: str
-    """A key of `UNITS`."""
+    """A key of `COLUMN_UNITS`."""
     names: tuple[str, ...]
     """Column names; three for force and rate. A leading minus reverses the sign."""
     unit: str | None = None
@@ -142,7 +142,7 @@ def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
     time = _with_unit(by_quantity['time'], lambda: _time_unit(table.raw(by_quantity['time'].names[0])), path)
     stamp_ns = table.stamps(time)
     force = _with_unit(by_quantity['force'], lambda: _force_unit(table.values(by_quantity['force'].names)), path)
-    force_s = table.values(force.names) * UNITS['force'][force.unit]
+    force_s = table.values(force.names) * COLUMN_UNITS['force'][force.unit]
     rate = _with_unit(by_quantity['rate'], lambda: _rate_unit(stamp_ns, force_s, table.values(by_quantity['rate'].names)), path)
     used, temperature, joints = [time, force, rate], None, []
     for each in found:
@@ -151,10 +151,10 @@ def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
             temperature = TemperatureSamples(stamp_ns, table.values(each.names)[:, 0])
         elif each.quantity == 'joint':
             joints.append(_with_unit(each, lambda: None, path))
-    imu = ImuSamples(stamp_ns, force_s, table.values(rate.names) * UNITS['rate'][rate.unit], 'imu_link')
+    imu = ImuSamples(stamp_ns, force_s, table.values(rate.names) * COLUMN_UNITS['rate'][rate.unit], 'imu_link')
     used += joints
     taken = {name.removeprefix('-') for each in used for name in each.names}
-    angles = {each.joint: table.values(each.names)[:, 0] * UNITS['joint'][each.unit] for each in joints}
+    angles = {each.joint: table.values(each.names)[:, 0] * COLUMN_UNITS['joint'][each.unit] for each in joints}
     return CsvLog(tuple(used), imu, JointSamples.of_angles(stamp_ns, angles) if angles else None, temperature,
                   tuple(name for name in table.names if name not in taken))
 
@@ -177,7 +177,7 @@ def _parse(text):
     names, colon, unit = rest.rpartition(':')
     if not colon:
         names, unit = rest, ''
-    units = UNITS.get(quantity, {})
+    units = COLUMN_UNITS.get(quantity, {})
     unit = SPELLINGS.get(quantity, {}).get(unit.lower(), unit) if unit else None
     names = tuple(name.strip() for name in names.split(',') if name.strip())
     if not units or (quantity == 'joint') != bool(joint) or len(names) != (3 if quantity in ('force', 'rate') else 1):
@@ -270,10 +270,10 @@ class _Table:
         values = self.raw(time.names[0])
         if values.dtype.kind == 'M':
             return values.astype(np.int64)
-        unit = UNITS['time'][time.unit]
-        bad = np.count_nonzero(~(np.abs(values * unit) < LONGEST))
+        unit = COLUMN_UNITS['time'][time.unit]
+        bad = np.count_nonzero(~(np.abs(values * unit) < MAX_TIME_SECONDS))
         if bad:
-            raise InputError(f'the time of every row of {self.path} must be a number below {LONGEST:g} s, got {bad} without one; '
+            raise InputError(f'the time of every row of {self.path} must be a number below {MAX_TIME_SECONDS:g} s, got {bad} without one; '
                              'remove these rows', code='csv_time')
         return stamps_of(values, unit)
 
@@ -298,7 +298,7 @@ def _guess(table):
         words, unit_text = _words(name)
         joint = re.fullmatch(r'joint[ ._](\w+?)(?: (?:position|angle))?', words)
         axis = re.fullmatch(r'(.*?) ?([xyz])', words)
-        for quantity, pattern in NAMES:
+        for quantity, pattern in COLUMN_PATTERNS:
             if quantity in axes:
                 if axis and re.fullmatch(pattern, axis.group(1)):
                     axes[quantity].setdefault(re.sub(r'[^a-z]', '', axis.group(1)), {})[axis.group(2)] = (name, _unit(quantity, unit_text))
@@ -334,7 +334,7 @@ def _words(name):
 def _unit(quantity, text):
     """Return the unit of a quantity by its spelling in a header, or None."""
     text = text.strip().replace(' ', '')
-    known = {unit.lower(): unit for unit in UNITS[quantity]} | SPELLINGS[quantity]
+    known = {unit.lower(): unit for unit in COLUMN_UNITS[quantity]} | SPELLINGS[quantity]
     return known.get(text)
 
 
@@ -350,7 +350,7 @@ def _time_unit(values):
 def _force_unit(force):
     """Return the unit in which the median length is that of gravity."""
     length = float(np.nanmedian(np.linalg.norm(force, axis=1)))
-    return next((unit for unit, size in UNITS['force'].items()
+    return next((unit for unit, size in COLUMN_UNITS['force'].items()
                  if 1 / GRAVITY_BAND < length * size / STANDARD_GRAVITY < GRAVITY_BAND), None)
 
 
@@ -362,7 +362,7 @@ def _rate_unit(stamp_ns, force_s, rate):
     turning = relate_turns(series.chunks())
     if turning is None:
         return None
-    return next((unit for unit, size in UNITS['rate'].items() if 1 / RATE_BAND < turning.factor / size < RATE_BAND), None)
+    return next((unit for unit, size in COLUMN_UNITS['rate'].items() if 1 / RATE_BAND < turning.factor / size < RATE_BAND), None)
 
 
 class CsvBag(Rosbag2):

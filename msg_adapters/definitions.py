@@ -8,7 +8,7 @@ from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE
 
 SEPARATOR = '=' * 80
-LONGEST, MOST_ELEMENTS = 100_000, 10_000
+MAX_DEFINITION_CHARACTERS, MAX_ELEMENTS = 100_000, 10_000
 """Characters of a definition and elements of a message at most, an array counted by its elements."""
 DEFAULT_TOPICS = {IMU_TYPE: '/imu/data_raw', JOINT_STATE_TYPE: '/joint_states', TEMPERATURE_TYPE: '/imu/temperature'}
 
@@ -93,8 +93,8 @@ def deserializer(message_type: str, definitions: dict[str, tuple[str, str]], ros
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
     types = dict(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY).fielddefs)
     encoding, text = definitions.get(message_type, ('', ''))
-    if len(text) > LONGEST:
-        raise ValueError(f'a definition of {len(text)} characters, at most {LONGEST} are accepted')
+    if len(text) > MAX_DEFINITION_CHARACTERS:
+        raise ValueError(f'a definition of {len(text)} characters, at most {MAX_DEFINITION_CHARACTERS} are accepted')
     if text and encoding == 'ros2msg':
         types.update(get_types_from_msg(text, message_type))
     elif text:
@@ -116,8 +116,8 @@ def _require_size(types, message_type):
         if known.setdefault(name, -1) >= 0:
             return known[name]
         known[name] = sum(_of(description) for _, description in types[name][1])
-        if known[name] > MOST_ELEMENTS:
-            raise ValueError(f'{name} has more than {MOST_ELEMENTS} elements')
+        if known[name] > MAX_ELEMENTS:
+            raise ValueError(f'{name} has more than {MAX_ELEMENTS} elements')
         return known[name]
 
     def _of(description):
@@ -138,7 +138,7 @@ def _require_size(types, message_type):
 
 def _flatten(text):
     """List the plain fields of a ros2msg definition in order, fields of nested types by their path (raises ValueError for too many)."""
-    if len(text) > LONGEST:
+    if len(text) > MAX_DEFINITION_CHARACTERS:
         raise ValueError('too long')
     n_lines = count()
     first, *others = text.replace('\r', '').split(SEPARATOR + '\n')
@@ -149,7 +149,7 @@ def _flatten(text):
 
     def expand(body, prefix):
         for line in body.split('\n'):
-            if next(n_lines) > MOST_ELEMENTS:
+            if next(n_lines) > MAX_ELEMENTS:
                 raise ValueError('too many fields')
             words = line.split('#')[0].split()
             if not words or '=' in line.split('#')[0]:   # empty, or a constant

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imu_calibration.preprocessing.recording_evidence import QUANTITIES, MessageEvidence
+from imu_calibration.preprocessing.recording_evidence import MESSAGE_QUANTITIES, MessageEvidence
 from msg_adapters.imu import find_imu_layout
 from msg_adapters.layout import MessageError
 
@@ -153,5 +153,5 @@ class ImuHeads:
             return MessageEvidence()
         quaternion, packed = self._stream.orientation(self._last)
         matrices = (*self._stream.covariances(self._last), self._stream.unpacked(packed))
-        covariances = dict(zip(QUANTITIES, matrices, strict=True))
+        covariances = dict(zip(MESSAGE_QUANTITIES, matrices, strict=True))
         return MessageEvidence(dict(self._frame_ids), covariances, np.array(quaternion), np.array(self._age))

@@ -25,7 +25,7 @@ from msg_adapters.layout import (
 
 JOINT_STATE_TYPE = 'sensor_msgs/msg/JointState'
 
-MOST_JOINTS, LARGEST_HEAD = 1000, 1 << 16
+MAX_MESSAGE_JOINTS, MAX_NAME_BYTES = 1000, 1 << 16
 """Joints of a message and bytes of their names; the time to compare names grows with the square of either."""
 MISSING_JOINT = 'JointState without every joint of the table'
 NO_POSITION = 'JointState without a position for every name'
@@ -45,9 +45,9 @@ def find_joint_layout(data: bytes) -> MessageLayout:
     walk = _Walk(bytes(data), header)
     try:
         n_names = walk.count()
-        names = tuple(walk.string() for _ in range(min(n_names, MOST_JOINTS)))
-        if n_names > MOST_JOINTS or walk.position > LARGEST_HEAD:
-            raise MessageError(f'a JointState must have at most {MOST_JOINTS} joints and {LARGEST_HEAD} bytes of names')
+        names = tuple(walk.string() for _ in range(min(n_names, MAX_MESSAGE_JOINTS)))
+        if n_names > MAX_MESSAGE_JOINTS or walk.position > MAX_NAME_BYTES:
+            raise MessageError(f'a JointState must have at most {MAX_MESSAGE_JOINTS} joints and {MAX_NAME_BYTES} bytes of names')
         offsets = {field: walk.doubles() for field in ('position', 'velocity', 'effort')}
     except struct.error:
         raise MessageError(f'a JointState of {len(data)} bytes ends before its last field') from None
@@ -91,7 +91,7 @@ def joints_from_rows(rows: Sequence[tuple[float, Sequence[float], Sequence[float
 def joint_columns(names: Sequence[str], n_positions: int, joint_names: Sequence[str]) -> list[int]:
     """Return the positions of the joints in a message with `names` (raises UnusableMessage)."""
     names = list(names)
-    if len(names) > MOST_JOINTS or any(name not in names for name in joint_names):
+    if len(names) > MAX_MESSAGE_JOINTS or any(name not in names for name in joint_names):
         raise UnusableMessage(MISSING_JOINT)
     if n_positions != len(names):
         raise UnusableMessage(NO_POSITION)

@@ -15,7 +15,7 @@ import numpy as np
 
 from msg_adapters.layout import clean_name, overlapping
 
-PIECE = 1 << 20
+PACKED_PIECE_BYTES = 1 << 20
 LARGEST_CHUNK, LARGEST_MESSAGE = 64 << 20, 32 << 20
 """Bytes of a chunk and of a message when decompressed; recorders write chunks of a few megabytes."""
 MESSAGE_BASE = 4 << 20
@@ -103,8 +103,8 @@ def decompress_file(source: Path, target: Path) -> str | None:
     with source.open('rb') as packed, Path(target).open('wb') as plain:
         decompressor, n_frames, data, started = module.ZstdDecompressor(), 0, b'', True
         try:
-            while data or not decompressor.needs_input or (data := packed.read(PIECE)):
-                plain.write(decompressor.decompress(data, PIECE))
+            while data or not decompressor.needs_input or (data := packed.read(PACKED_PIECE_BYTES)):
+                plain.write(decompressor.decompress(data, PACKED_PIECE_BYTES))
                 data, started = b'', True
                 if decompressor.eof:   # a file may hold several frames
                     data, decompressor, n_frames = decompressor.unused_data, module.ZstdDecompressor(), n_frames + 1

@@ -197,7 +197,7 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     """Return the content of metadata.yaml; empty when there is none or it is damaged, as after a crash of the recorder."""
     try:
         with open_regular(folder / 'metadata.yaml') as file:
-            text = file.read(documents.LARGEST + 1).decode()
+            text = file.read(documents.MAX_DOCUMENT_CHARACTERS + 1).decode()
         information = documents.parsed(text, 'metadata', aliases=True)['rosbag2_bagfile_information']
         for entry in information['topics_with_message_count']:
             topic, entry['message_count'] = entry['topic_metadata'], int(entry['message_count'])

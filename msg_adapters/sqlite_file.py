@@ -18,7 +18,7 @@ from msg_adapters.layout import Packed, clean_name
 from msg_adapters.sqlite_pages import PageReader
 from msg_adapters.storage import StorageFile, Stretch, read_ahead
 
-COLUMNS = ['id', 'topic_id', 'timestamp', 'data']
+MESSAGE_COLUMNS = ['id', 'topic_id', 'timestamp', 'data']
 STRETCH_ROWS = 8192
 TABLES = ('topics', 'messages', 'message_definitions')
 MOST_TABLES, MOST_TOPICS = 1000, 100_000
@@ -123,7 +123,7 @@ class SqliteFile(StorageFile):
         """Return the root page of the table of messages, or None when only SQL can read it (write-ahead log, other columns)."""
         columns = [row[1] for row in self.connection.execute('PRAGMA table_info(messages)')]
         found = self.connection.execute("SELECT rootpage, sql FROM sqlite_master WHERE type = 'table' AND name = 'messages'").fetchone()
-        if self.logged or columns != COLUMNS or not found or 'INTEGER PRIMARY KEY' not in found[1].upper():
+        if self.logged or columns != MESSAGE_COLUMNS or not found or 'INTEGER PRIMARY KEY' not in found[1].upper():
             return None
         return found[0]
 
@@ -183,7 +183,7 @@ def _connect(path, logged):
     return connection
 
 
-SCHEMA = (
+SCHEMA_STATEMENTS = (
     'CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL)',
     'CREATE TABLE metadata(id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL)',
     'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL, '
@@ -203,7 +203,7 @@ class SqliteWriter:
         for pragma in ('journal_mode = OFF', 'synchronous = OFF', 'locking_mode = EXCLUSIVE', 'cache_size = -16000'):
             self.connection.execute('PRAGMA ' + pragma)
         self.connection.execute('BEGIN')
-        for statement in SCHEMA:
+        for statement in SCHEMA_STATEMENTS:
             self.connection.execute(statement)
         self.connection.execute('INSERT INTO schema VALUES (4, ?)', (ros_distro,))
 

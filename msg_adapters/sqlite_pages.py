@@ -23,7 +23,7 @@ _INTEGER_SIZE = np.array([0, 1, 2, 3, 4, 6, 8, 8, 0, 0, 0, 0], dtype=np.int64)
 """Bytes of a value by its serial type (file format, section 2.1)."""
 
 
-MARGIN = 64
+PADDING_BYTES = 64
 """Zeros after the pages, so that six varints never exceed the buffer."""
 
 
@@ -170,7 +170,7 @@ class PageReader:
             ordered = np.sort(pages)
             cuts = np.flatnonzero(np.diff(ordered) > 8) + 1
             runs = [(run[0], run[-1] + 1) for run in np.split(ordered, cuts)]
-        buffer = np.zeros(sum(int(last - first) for first, last in runs) * self.page_size + MARGIN, dtype=np.uint8)
+        buffer = np.zeros(sum(int(last - first) for first, last in runs) * self.page_size + PADDING_BYTES, dtype=np.uint8)
         filled, firsts, bases = 0, [], []
         for first, last in runs:
             size = int(last - first) * self.page_size

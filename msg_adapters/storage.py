@@ -117,21 +117,21 @@ class StorageFile:
         self.lost[reason] = self.lost.get(reason, 0) + count
 
 
-T = TypeVar('T')
+Piece = TypeVar('Piece')
 
-DEPTH = 2
+MAX_WAITING_PIECES = 2
 """Pieces that wait at most; bounds the memory."""
 
 _END = object()
 
 
-def read_ahead(pieces: Generator[T, None, None]) -> Generator[T, None, None]:
+def read_ahead(pieces: Generator[Piece, None, None]) -> Generator[Piece, None, None]:
     """
     Run a generator in a thread and yield its items in order; its exceptions are raised here.
 
     The thread ends with the generator, or soon after the consumer has closed this one.
     """
-    waiting: queue.Queue[Any] = queue.Queue(DEPTH)
+    waiting: queue.Queue[Any] = queue.Queue(MAX_WAITING_PIECES)
     stop = threading.Event()
 
     def put(item):

@@ -17,13 +17,13 @@ from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, en
 from msg_adapters.layout import Packed, from_ns
 
 NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0)
-UNKNOWN = (0.0,) * 9
-ABSENT = (-1.0,) + (0.0,) * 8
+UNKNOWN_COVARIANCE = (0.0,) * 9
+ABSENT_COVARIANCE = (-1.0,) + (0.0,) * 8
 """Covariances: all zeros means unknown, -1 first means that the message does not hold the quantity."""
 
 
-def encode_imu(imu: ImuSamples, frame_id: str | None = None, force_cov: ArrayLike = UNKNOWN, *,
-               rate_cov: ArrayLike = UNKNOWN) -> np.ndarray:
+def encode_imu(imu: ImuSamples, frame_id: str | None = None, force_cov: ArrayLike = UNKNOWN_COVARIANCE, *,
+               rate_cov: ArrayLike = UNKNOWN_COVARIANCE) -> np.ndarray:
     """
     Serialize ImuSamples; the orientation is declared absent.
 
@@ -34,7 +34,7 @@ def encode_imu(imu: ImuSamples, frame_id: str | None = None, force_cov: ArrayLik
 
     """
     doubles = np.zeros((len(imu), N_DOUBLES), dtype='<f8')
-    columns = {'orientation': NO_ORIENTATION, 'orientation_cov': ABSENT, 'rate_s': imu.rate_s, 'force_s': imu.force_s,
+    columns = {'orientation': NO_ORIENTATION, 'orientation_cov': ABSENT_COVARIANCE, 'rate_s': imu.rate_s, 'force_s': imu.force_s,
                'rate_cov': np.ravel(rate_cov), 'force_cov': np.ravel(force_cov)}
     for name, value in columns.items():
         doubles[:, FIELDS[name]] = value
@@ -100,14 +100,14 @@ def _constant(data, n):
     return np.broadcast_to(np.frombuffer(data, dtype=np.uint8), (n, len(data)))
 
 
-BATCH = 65536
+WRITE_BATCH = 65536
 """Messages handed to the storage at once; bounds the memory of a long recording."""
 
 
 def write_session(path: str | PathLike[str], imu: ImuSamples, joints: JointSamples | None = None, *,
                   temperature: TemperatureSamples | None = None, storage: str = 'sqlite3', imu_topic: str = DEFAULT_TOPICS[IMU_TYPE],
                   joint_topic: str = DEFAULT_TOPICS[JOINT_STATE_TYPE], temperature_topic: str = DEFAULT_TOPICS[TEMPERATURE_TYPE],
-                  force_cov: ArrayLike = UNKNOWN, rate_cov: ArrayLike = UNKNOWN, **options: Any) -> None:
+                  force_cov: ArrayLike = UNKNOWN_COVARIANCE, rate_cov: ArrayLike = UNKNOWN_COVARIANCE, **options: Any) -> None:
     """
     Write a session into a new bag; receive times are the header stamps, made monotone per topic.
 
@@ -168,7 +168,7 @@ def write_trajectories(path: str | PathLike[str], parts: Sequence[tuple[int, Tra
 def _merged(received):
     """Cut the merged streams into batches; yield for each stream its slice of a batch."""
     everything = np.sort(np.concatenate(received), kind='stable')
-    limits = [*everything[BATCH::BATCH], None]
+    limits = [*everything[WRITE_BATCH::WRITE_BATCH], None]
     starts = [0] * len(received)
     for limit in limits:
         ends = [len(times) if limit is None else int(np.searchsorted(times, limit)) for times in received]

@@ -205,9 +205,9 @@ def overlapping_allan_variance(values: np.ndarray, factors: np.ndarray) -> np.nd
     return sums.variance()
 
 
-REGULAR = 0.2
+MAX_STEP_JITTER = 0.2
 """Largest typical departure of steps from the period, in periods, up to which a single step is believed."""
-WINDOW = 64
+STAMP_WINDOW_SAMPLES = 64
 """Samples over which irregular stamps are averaged."""
 
 
@@ -235,7 +235,7 @@ class SampleGrid:
         before = stamp_ns[0] - round(self._period_ns) if self._last_ns is None else self._last_ns
         step = np.diff(stamp_ns, prepend=before) / self._period_ns
         self._last_ns = int(stamp_ns[-1])
-        if np.median(np.abs(step - 1.0)) <= REGULAR:
+        if np.median(np.abs(step - 1.0)) <= MAX_STEP_JITTER:
             return np.maximum(np.rint(step), 1).astype(np.int64)
         return 1 + _lost(step)
 
@@ -243,13 +243,13 @@ class SampleGrid:
 def _lost(step):
     """Return how many samples were lost before each, from persistent delays."""
     lost = np.zeros(len(step), np.int64)
-    windows = len(step) // WINDOW
+    windows = len(step) // STAMP_WINDOW_SAMPLES
     if windows < 2:
         return lost
     late = np.cumsum(step - 1.0)
-    middle = np.median(late[:windows * WINDOW].reshape(windows, WINDOW), axis=1)
+    middle = np.median(late[:windows * STAMP_WINDOW_SAMPLES].reshape(windows, STAMP_WINDOW_SAMPLES), axis=1)
     for k in np.flatnonzero(np.diff(middle) > 0.75):
-        longest = (k * WINDOW) + int(np.argmax(step[k * WINDOW:(k + 2) * WINDOW]))
+        longest = (k * STAMP_WINDOW_SAMPLES) + int(np.argmax(step[k * STAMP_WINDOW_SAMPLES:(k + 2) * STAMP_WINDOW_SAMPLES]))
         lost[longest] += round(middle[k + 1] - middle[k])
     return lost
 

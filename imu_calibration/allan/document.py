@@ -7,23 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import toeplitz
 
-from imu_calibration.allan.figures import HORIZON, SLOW, AxisFigures, NoiseFigures, TrendFigure
+from imu_calibration.allan.figures import HORIZON, SLOW_PROCESSES, AxisFigures, NoiseFigures, TrendFigure
 from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, NoiseProcess, mean_covariance
-from imu_calibration.allan.terms import DETERMINED, HELD, TIME, WEAK, Term
+from imu_calibration.allan.terms import TERM_DETERMINED, TERM_HELD, TERM_WEAK, TIME_KEY, Term
 from imu_calibration.core.documents import finite, from_text, to_text
 from imu_calibration.core.errors import DocumentError
-from imu_calibration.core.units import NOISE, STANDARD_GRAVITY, for_people, significant
-from imu_calibration.effects.base import AXES, SENSORS, UNIT
+from imu_calibration.core.units import NOISE_QUANTITY, STANDARD_GRAVITY, for_people, significant
+from imu_calibration.effects.base import AXES, SENSORS, UNITS
 
-FORMAT = 'imu_calibration/noise/1'
-UNITS = {
-    'accelerometer': {QUANTISATION.name: 'm/s', WHITE.name: 'm/s^2/sqrt(Hz)', FLICKER.name: 'm/s^2', 'gauss_markov': 'm/s^2', TIME: 's',
+NOISE_FORMAT = 'imu_calibration/noise/1'
+NOISE_UNITS = {
+    'accelerometer': {QUANTISATION.name: 'm/s', WHITE.name: 'm/s^2/sqrt(Hz)', FLICKER.name: 'm/s^2', 'gauss_markov': 'm/s^2', TIME_KEY: 's',
                       RANDOM_WALK.name: 'm/s^3/sqrt(Hz)', 'temperature': 'm/s^2/K', 'turn_on': 'm/s^2', 'ramp': 'm/s^3'},
-    'gyroscope': {QUANTISATION.name: 'rad', WHITE.name: 'rad/s/sqrt(Hz)', FLICKER.name: 'rad/s', 'gauss_markov': 'rad/s', TIME: 's',
+    'gyroscope': {QUANTISATION.name: 'rad', WHITE.name: 'rad/s/sqrt(Hz)', FLICKER.name: 'rad/s', 'gauss_markov': 'rad/s', TIME_KEY: 's',
                   RANDOM_WALK.name: 'rad/s^2/sqrt(Hz)', 'temperature': 'rad/s/K', 'turn_on': 'rad/s', 'ramp': 'rad/s^2'}}
 """Unit of every figure."""
-TERMS = (QUANTISATION.name, WHITE.name, FLICKER.name, 'gauss_markov', TIME, RANDOM_WALK.name)
-STATUSES = (DETERMINED, WEAK, HELD)
+TERMS = (QUANTISATION.name, WHITE.name, FLICKER.name, 'gauss_markov', TIME_KEY, RANDOM_WALK.name)
+STATUSES = (TERM_DETERMINED, TERM_WEAK, TERM_HELD)
 
 
 def noise_to_text(figures: NoiseFigures, horizon: float = HORIZON) -> str:
@@ -33,7 +33,7 @@ def noise_to_text(figures: NoiseFigures, horizon: float = HORIZON) -> str:
 
 def to_mapping(figures: NoiseFigures, horizon: float = HORIZON) -> dict:
     """Return the document as plain dicts, lists, numbers and strings, in a fixed order."""
-    document = {'format': FORMAT, 'frame_id': figures.frame_id, 'sampling_rate': float(f'{figures.rate:.9g}'),
+    document = {'format': NOISE_FORMAT, 'frame_id': figures.frame_id, 'sampling_rate': float(f'{figures.rate:.9g}'),
                 'recording': figures.recording}
     for sensor in SENSORS:
         document[sensor] = _sensor_section(sensor, figures.sensor(sensor))
@@ -48,10 +48,10 @@ def _sensor_section(sensor, axes):
     section: dict = {}
     for name in TERMS:
         if any(name in axis.terms for axis in axes):
-            section[name] = _entry([axis.terms.get(name) for axis in axes], UNITS[sensor][name])
+            section[name] = _entry([axis.terms.get(name) for axis in axes], NOISE_UNITS[sensor][name])
     section['slow_part'] = [list(axis.form) for axis in axes]
     section['also_possible'] = [[list(form) for form in axis.others] for axis in axes]
-    section['alternatives'] = {name: _entry([axis.alternatives.get(name) for axis in axes], UNITS[sensor][name])
+    section['alternatives'] = {name: _entry([axis.alternatives.get(name) for axis in axes], NOISE_UNITS[sensor][name])
                                for name in TERMS if any(name in axis.alternatives for axis in axes)}
     section['taken_out'] = _trends(sensor, axes)
     section['record_for'] = {name: [axis.record_for.get(name) for axis in axes]
@@ -80,7 +80,7 @@ def _trends(sensor, axes):
         found[name] = {key: [None if trend is None else float(getattr(trend, key)) for trend in trends] for key in ('value', 'sd')}
         if name == 'turn_on':
             found[name]['time_constant'] = [None if trend is None else float(trend.time) for trend in trends]
-        found[name]['unit'] = UNITS[sensor][name]
+        found[name]['unit'] = NOISE_UNITS[sensor][name]
     return found
 
 
@@ -103,13 +103,13 @@ def noise_from_text(text: str) -> NoiseFigures:
     """
     document = from_text(text, 'noise document')
     found = str(document.get('format'))
-    if found != FORMAT:
-        raise DocumentError(f"a noise document must have 'format: {FORMAT}', got '{found}'; give a file written by 'imu_calibration noise'",
-                            code='document_format')
+    if found != NOISE_FORMAT:
+        raise DocumentError(f"a noise document must have 'format: {NOISE_FORMAT}', got '{found}'; give a file written by "
+                            "'imu_calibration noise'", code='document_format')
     try:
         return _parse(document)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise DocumentError(f'a noise document must have the parts of {FORMAT}, one is missing or has another shape '
+        raise DocumentError(f'a noise document must have the parts of {NOISE_FORMAT}, one is missing or has another shape '
                             f'({type(error).__name__}: {error}); identify the noise again', code='document_parts') from error
 
 
@@ -133,7 +133,7 @@ def _axis(section, k, deviation):
                     if entry['interval95'][k] is not None}
     trends = tuple(TrendFigure(name, float(entry['value'][k]), float(entry['sd'][k]), float(entry.get('time_constant', [0, 0, 0])[k]))
                    for name, entry in (section.get('taken_out') or {}).items() if entry['value'][k] is not None)
-    record_for = {name: values[k] for name, values in (section.get('record_for') or {}).items() if terms[name].status != DETERMINED}
+    record_for = {name: values[k] for name, values in (section.get('record_for') or {}).items() if terms[name].status != TERM_DETERMINED}
     others = tuple(tuple(form) for form in section['also_possible'][k])
     return AxisFigures(terms, tuple(section['slow_part'][k]), others, alternatives, trends, record_for, float(section['sample_sd'][k]),
                        float(section['shortest_averaging_time'][k]), float(section['excess'][k]),
@@ -151,13 +151,13 @@ def _term(name, entry, k):
     if status not in STATUSES or len(interval) != 2 or not 0 <= interval[0] <= interval[1]:
         raise DocumentError(f"'{name}' must have a status ({', '.join(STATUSES)}) and an interval of two numbers in rising order, got "
                             f'{status!r} and {list(interval)}; write the noise document again', code='status_or_interval')
-    if (value is None) != (status == HELD) or (value is not None and not np.isfinite(float(value))):
+    if (value is None) != (status == TERM_HELD) or (value is not None and not np.isfinite(float(value))):
         raise DocumentError(f"'{name}' must have a finite value unless it is held, got {value!r} and '{status}'; "
                             'write the noise document again', code='value_missing')
     return Term(name, None if value is None else float(value), interval, status, str((entry.get('reason') or [''] * 3)[k]))
 
 
-FINEST, MOST_BLOCKS = 150, 1000
+MAX_RUN_BLOCKS, MAX_NAVIGATION_BLOCKS = 150, 1000
 """Blocks of the run at most, and of alignment and run together."""
 RUNS = (1.0, 10.0, 60.0, 600.0)
 """Lengths of dead reckoning, s."""
@@ -195,7 +195,7 @@ def position_sd(processes: Sequence[NoiseProcess], coefficients: Sequence[float]
         m/s^2.
 
     """
-    after = int(np.ceil(min(FINEST, MOST_BLOCKS * seconds / (seconds + alignment))))
+    after = int(np.ceil(min(MAX_RUN_BLOCKS, MAX_NAVIGATION_BLOCKS * seconds / (seconds + alignment))))
     step = seconds / after
     before = max(round(alignment / step), 1)
     until_end = (after - np.arange(after) - 0.5) * step
@@ -207,7 +207,7 @@ def position_sd(processes: Sequence[NoiseProcess], coefficients: Sequence[float]
 
 
 TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bias_instability': 'bias instability B',
-          'gauss_markov': 'Gauss–Markov σ', TIME: 'correlation time τ', 'random_walk': 'random walk K',
+          'gauss_markov': 'Gauss–Markov σ', TIME_KEY: 'correlation time τ', 'random_walk': 'random walk K',
           'temperature': 'follows the temperature', 'turn_on': 'settles after turn-on', 'ramp': 'drifts steadily'}
 BASIS = {'walk': 'as found', 'equivalent': 'equivalent of the slow noise', 'bound': 'none detected: upper limit'}
 NO_BOUND = 'no bound'
@@ -251,7 +251,7 @@ def rows(figures: NoiseFigures) -> list[FigureRow]:
 
 
 def _row(sensor, letter, axis, term):
-    factor, unit = for_people(UNITS[sensor][term.name], NOISE)
+    factor, unit = for_people(NOISE_UNITS[sensor][term.name], NOISE_QUANTITY)
     lower, upper = (end * factor for end in term.interval)
     if term.value is None:
         value, interval = f'< {significant(upper)}' if np.isfinite(upper) else NO_BOUND, ''
@@ -293,19 +293,19 @@ def duration(seconds: float) -> str:
 def requested(axis: AxisFigures) -> list[Term]:
     """Return the figures of an axis that count: white noise and the slow part, or the random walk where no slow part is seen."""
     names = [WHITE.name, *(axis.form or (RANDOM_WALK.name,))]
-    return [axis.terms[name] for name in [*names, *([TIME] if 'gauss_markov' in names else [])]]
+    return [axis.terms[name] for name in [*names, *([TIME_KEY] if 'gauss_markov' in names else [])]]
 
 
 def counts(figures: NoiseFigures) -> dict[str, int]:
     """Return how many of the figures that count are determined, weak and held."""
     statuses = [term.status for sensor in SENSORS for axis in figures.sensor(sensor) for term in requested(axis)]
-    return {status: statuses.count(status) for status in (DETERMINED, WEAK, HELD)}
+    return {status: statuses.count(status) for status in (TERM_DETERMINED, TERM_WEAK, TERM_HELD)}
 
 
 def exit_code(figures: NoiseFigures) -> int:
     """Return 0 when every required figure is determined and no sample was lost, else 3."""
     found = counts(figures)
-    return 3 if found[WEAK] or found[HELD] or figures.recording.get('dropped') else 0
+    return 3 if found[TERM_WEAK] or found[TERM_HELD] or figures.recording.get('dropped') else 0
 
 
 def lines(figures: NoiseFigures) -> list[str]:
@@ -314,7 +314,7 @@ def lines(figures: NoiseFigures) -> list[str]:
     for sensor in SENSORS:
         for letter, axis in zip(AXES, figures.sensor(sensor)):
             found += _axis_lines(f'{sensor} {letter}', sensor, axis)
-    if any(name in SLOW for sensor in SENSORS for axis in figures.sensor(sensor) for name in axis.form):
+    if any(name in SLOW_PROCESSES for sensor in SENSORS for axis in figures.sensor(sensor) for name in axis.form):
         found.append('slow noise (bias instability, Gauss–Markov, random walk): the intervals are valid for this recording; '
                      'values of a second recording can lie outside')
     longest = _longest(figures)
@@ -338,7 +338,7 @@ def _rest_line(recording):
 def _axis_lines(name, sensor, axis):
     found = []
     for trend in axis.trends:
-        factor, unit = for_people(UNITS[sensor][trend.name], NOISE)
+        factor, unit = for_people(NOISE_UNITS[sensor][trend.name], NOISE_QUANTITY)
         constant = f' within {duration(trend.time)}' if trend.name == 'turn_on' else ''
         size = f'{significant(trend.value * factor)} ± {significant(trend.sd * factor, 2)} {unit}'
         found.append(f'{name} {TITLES[trend.name]}: {size}{constant}; removed')
@@ -357,7 +357,7 @@ def _hump(sensor, axis):
     """Return the line of the periodogram at the hump of a curve, or ''."""
     if axis.oscillation is None:
         return ''
-    (frequency, amplitude), (factor, unit) = axis.oscillation, for_people(UNIT[sensor], NOISE)
+    (frequency, amplitude), (factor, unit) = axis.oscillation, for_people(UNITS[sensor], NOISE_QUANTITY)
     return f', with an oscillation of {significant(amplitude * factor, 2)} {unit} at {significant(frequency, 3)} Hz'
 
 
@@ -381,9 +381,9 @@ def filter_lines(figures: NoiseFigures, rates: list[float], horizon: float = HOR
     found = []
     for sensor in SENSORS:
         densities = figures.densities(sensor, horizon)
-        units = UNITS[sensor]
+        units = NOISE_UNITS[sensor]
         found.append(f'for filters, {sensor}: white noise {significant(densities.white)} {units[WHITE.name]},')
         found.append(f'    random walk {_bounded(densities.walk)} {units[RANDOM_WALK.name]} ({BASIS[densities.basis]})')
-        found += [f'    at {rate:.6g} Hz: sample sd {significant(densities.sample_sd(rate))} {UNIT[sensor]}, '
-                  f'bias step sd {_bounded(densities.step_sd(rate))} {UNIT[sensor]}' for rate in rates]
+        found += [f'    at {rate:.6g} Hz: sample sd {significant(densities.sample_sd(rate))} {UNITS[sensor]}, '
+                  f'bias step sd {_bounded(densities.step_sd(rate))} {UNITS[sensor]}' for rate in rates]
     return found

@@ -5,13 +5,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, NoiseProcess, allan_variance, gauss_markov
-from imu_calibration.allan.terms import TIME, Term
+from imu_calibration.allan.terms import TIME_KEY, Term
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import BiasProcess
 
 HORIZON = 100.0
 """s; for a filter with white noise and a random walk only: the walk has the same Allan variance at this averaging time."""
-SLOW = (FLICKER.name, RANDOM_WALK.name, 'gauss_markov')
+SLOW_PROCESSES = (FLICKER.name, RANDOM_WALK.name, 'gauss_markov')
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class AxisFigures:
 
     def _process(self, name):
         if name == 'gauss_markov':
-            return gauss_markov(self.terms[TIME].value or self.terms[TIME].interval[0])
+            return gauss_markov(self.terms[TIME_KEY].value or self.terms[TIME_KEY].interval[0])
         return {process.name: process for process in (QUANTISATION, WHITE, FLICKER, RANDOM_WALK)}[name]
 
     @property
@@ -90,7 +90,7 @@ class AxisFigures:
         The walk with the total Allan variance of the slow processes at the horizon; without a slow part in the curve, the
         largest walk that the curve allows.
         """
-        slow = [(process, coefficient) for process, coefficient in self.processes() if process.name in SLOW]
+        slow = [(process, coefficient) for process, coefficient in self.processes() if process.name in SLOW_PROCESSES]
         if not slow:
             return self.terms[RANDOM_WALK.name].interval[1], 'bound'
         variance = sum(coefficient * float(allan_variance(process, np.array([horizon]))[0]) for process, coefficient in slow)
@@ -148,9 +148,9 @@ class Densities:
         return self.walk / float(np.sqrt(rate))
 
 
-RATIO = 4.0
+PROCESS_TIME_RATIO = 4.0
 """Of neighbouring times: the density ripples by a hundredth."""
-TIMES = RATIO ** np.arange(1, 8)
+PROCESS_TIMES = PROCESS_TIME_RATIO ** np.arange(1, 8)
 """s: from the length of windows to four times that of sessions of an hour."""
 
 
@@ -166,8 +166,8 @@ def bias_processes(figures: NoiseFigures) -> dict[str, tuple[BiasProcess, ...]]:
 def _processes(axes):
     share = 1.0 / len(axes)
     flicker, walk = (share * sum(axis[name][1] for axis in axes if name in axis) for name in (FLICKER.name, RANDOM_WALK.name))
-    variances = {time: flicker * np.log(RATIO) / np.pi for time in TIMES}
-    variances[TIMES[-1]] += walk * TIMES[-1] / 2.0
+    variances = {time: flicker * np.log(PROCESS_TIME_RATIO) / np.pi for time in PROCESS_TIMES}
+    variances[PROCESS_TIMES[-1]] += walk * PROCESS_TIMES[-1] / 2.0
     for axis in axes:
         if 'gauss_markov' in axis:
             process, coefficient = axis['gauss_markov']

@@ -11,8 +11,8 @@ from imu_calibration.allan.figures import AxisFigures, NoiseFigures, TrendFigure
 from imu_calibration.allan.moment_fit import Moments, Whitener
 from imu_calibration.allan.processes import RANDOM_WALK, WHITE, NoiseProcess, ScaleCovariance
 from imu_calibration.allan.still_parts import LeftOut, StillPart, Survey, still_parts, survey
-from imu_calibration.allan.terms import DETERMINED, LEAST_SCALES, PROCESSES, AxisNoise, identify_axis
-from imu_calibration.allan.trends import MOST_BLOCKS, AxisTrend, Blocks, TrendSearch
+from imu_calibration.allan.terms import LEAST_SCALES, PROCESSES, TERM_DETERMINED, AxisNoise, identify_axis
+from imu_calibration.allan.trends import MAX_TREND_BLOCKS, AxisTrend, Blocks, TrendSearch
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import NominalScaling, SampleBlock
@@ -24,11 +24,11 @@ FEWEST_CYCLES = 16
 """Cycles in the longest rest, at least: with fewer, slow noise and a line are not separable."""
 PER_CYCLE = 16
 """Block means per cycle: twice the hump's frequency, the highest under test, has eight."""
-LOBE, NEIGHBOURS = 2, 9
+LINE_HALF_BINS, LINE_NEIGHBOUR_BINS = 2, 9
 """Half width of a line under a Hann window, and distance of the farthest neighbouring ordinates, in bins."""
-INDEPENDENT = 2 / 3
+HANN_INDEPENDENT_SHARE = 2 / 3
 """Share of independent ordinates under a Hann window, whose noise bandwidth is 1.5 bins."""
-SIGNIFICANT = 1e-4
+LINE_P_VALUE = 1e-4
 """Significance level over all frequencies under test: six axes of 100 recordings without a line give 0.06 false ones."""
 
 
@@ -75,21 +75,21 @@ class ToneSearch:
 
     def line(self) -> tuple[float, float] | None:
         """Return (frequency in Hz, amplitude) of the most significant line, None without a significant one."""
-        bins = np.arange(NEIGHBOURS, len(self._power) - NEIGHBOURS)
+        bins = np.arange(LINE_NEIGHBOUR_BINS, len(self._power) - LINE_NEIGHBOUR_BINS)
         hertz = 1 / (max(self._size, 1) * self._step)
         bins = bins[(bins * hertz >= 0.5 * self._frequency) & (bins * hertz <= 2 * self._frequency)]
         if not self._count or not len(bins):
             return None
-        offsets = np.r_[-NEIGHBOURS:-LOBE, LOBE + 1:NEIGHBOURS + 1]
+        offsets = np.r_[-LINE_NEIGHBOUR_BINS:-LINE_HALF_BINS, LINE_HALF_BINS + 1:LINE_NEIGHBOUR_BINS + 1]
         around = self._power[bins[:, None] + offsets].mean(axis=1)
         ratio = self._power[bins] / around
         best = int(np.argmax(ratio))
-        if not f_sf(ratio[best], 2 * self._count, 2 * self._count * len(offsets) * INDEPENDENT) * len(bins) < SIGNIFICANT:
+        if not f_sf(ratio[best], 2 * self._count, 2 * self._count * len(offsets) * HANN_INDEPENDENT_SHARE) * len(bins) < LINE_P_VALUE:
             return None
-        lobe = np.arange(bins[best] - LOBE, bins[best] + LOBE + 1)
+        lobe = np.arange(bins[best] - LINE_HALF_BINS, bins[best] + LINE_HALF_BINS + 1)
         power = self._power[lobe]
         place = float(power @ lobe / power.sum()) * hertz
-        square = max(power.sum() - len(lobe) * around[best], 0.0) / self._count * 2 * INDEPENDENT
+        square = max(power.sum() - len(lobe) * around[best], 0.0) / self._count * 2 * HANN_INDEPENDENT_SHARE
         return place, float(np.sqrt(square) / np.sinc(place * self._step))
 
 
@@ -143,7 +143,7 @@ class RecordingTimes:
         return Moments(scales, np.ones(len(scales.factors)), np.ones(len(scales.factors), bool))
 
 
-LEAST_SAMPLES = 1000
+MIN_CURVE_SAMPLES = 1000
 """Least number of samples at rest for a curve."""
 EPOCH_GAP = 1.0
 """Time between two epochs of the clock, s; the true one is unknown."""
@@ -215,8 +215,8 @@ def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScali
     pieces = [still_parts(chunks, found.period) for chunks in found.epochs]
     parts, left_out = [part for part, _ in pieces], _joined([left for _, left in pieces])
     seconds = sum(part.seconds for of_epoch in parts for part in of_epoch)
-    if seconds < LEAST_SAMPLES * found.period or not found.period:
-        raise InputError(f'the IMU must rest for at least {LEAST_SAMPLES} samples, it rested for {seconds:.1f} s; '
+    if seconds < MIN_CURVE_SAMPLES * found.period or not found.period:
+        raise InputError(f'the IMU must rest for at least {MIN_CURVE_SAMPLES} samples, it rested for {seconds:.1f} s; '
                          'record with the IMU lying still on something heavy, for an hour if you can', code='rest_too_short')
     clock = _Clock(found.epochs)
     search = TrendSearch(_blocks(found, parts, clock))
@@ -267,7 +267,7 @@ def _record_for(axis, times):
     found = {}
     for name, term in axis.terms.items():
         asked = name in (WHITE.name, RANDOM_WALK.name, *axis.form)
-        if term.status == DETERMINED or not asked or name not in PROCESSES or not np.isfinite(term.interval[1]):
+        if term.status == TERM_DETERMINED or not asked or name not in PROCESSES or not np.isfinite(term.interval[1]):
             continue
         processes, coefficients = list(axis.fit.processes), list(axis.fit.coefficients)
         if name not in axis.fit.names:
@@ -308,7 +308,7 @@ class _Clock:
 def _blocks(found, parts, clock):
     """Return the means of equal numbers of chunks within the parts."""
     total = sum(part.chunks.stop - part.chunks.start for of_epoch in parts for part in of_epoch)
-    size = max(int(np.ceil(total / MOST_BLOCKS)), 1)
+    size = max(int(np.ceil(total / MAX_TREND_BLOCKS)), 1)
     time, mean, number, seconds = [], [], [], 0.0
     for epoch, (chunks, of_epoch) in enumerate(zip(found.epochs, parts)):
         for part in of_epoch:

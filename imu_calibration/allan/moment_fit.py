@@ -12,7 +12,7 @@ from scipy.special import gammainc, gammaincc, ndtr
 from imu_calibration.allan.processes import NoiseProcess, ScaleCovariance, gauss_markov
 from imu_calibration.allan.trends import KeptShare, Parts
 
-STEPS = 25
+MAX_WEIGHT_ROUNDS = 25
 """Rounds of weights and coefficients at most."""
 FLOOR = 1e-6
 """Least share of the upper limit of each process in the weights, so that they are finite."""
@@ -123,7 +123,7 @@ def fit_processes(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: 
     for k, value in (fixed or {}).items():
         values[k] = value
     floor = FLOOR * np.min(target[:, None] / design, axis=0)
-    for _ in range(STEPS):
+    for _ in range(MAX_WEIGHT_ROUNDS):
         covariance = moments.covariance(design, tensor, np.maximum(values, floor))
         whitener = Whitener(covariance)
         new = values.copy()
@@ -231,9 +231,9 @@ def _costs(known, wander, rest, held):
 
 TAIL = 0.025
 """Probability beyond each end."""
-LARGEST = 20.0
+MAX_LOG_RATIO = 20.0
 """Largest logarithm of an end over the estimate."""
-EXACT = 0.02
+INTERVAL_ACCURACY_SDS = 0.02
 """Accuracy of the ends, in standard deviations."""
 
 
@@ -414,6 +414,6 @@ def _crossing(function, start, step):
     near, far = np.log(start), np.log(start) + 2.0 * step
     while function(np.exp(far)) > 0:
         near, far = far, far + 1.6 * (far - near)
-        if abs(far - np.log(start)) > LARGEST:
+        if abs(far - np.log(start)) > MAX_LOG_RATIO:
             return np.inf if step > 0 else 0.0
-    return float(np.exp(brentq(lambda x: function(np.exp(x)), near, far, xtol=EXACT * abs(step))))
+    return float(np.exp(brentq(lambda x: function(np.exp(x)), near, far, xtol=INTERVAL_ACCURACY_SDS * abs(step))))

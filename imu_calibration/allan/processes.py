@@ -90,9 +90,9 @@ FLATNESS = (2 * np.log(2) / np.pi)**0.5
 SECOND_DIFFERENCE = (1.0, -2.0, 1.0)
 DENSE = np.arange(-36, 37) / 12
 """Lags around where a difference begins or ends, in units of the shorter averaging time; good to thousandths of a correlation."""
-GROWTH, REACH = 1.5, 64.0
+LAG_GROWTH, MAX_LAG_RATIO = 1.5, 64.0
 """Further lags grow by this factor, up to this many of the longer averaging time."""
-ROUNDING = 1e-14
+DIFFERENCE_ROUNDING = 1e-14
 """Share of the terms of a fourth difference below which it is a rounding error."""
 MOST_LENGTHS = 24
 """Stretches are sorted into this many lengths at most."""
@@ -191,7 +191,7 @@ class ScaleCovariance:
                 term = at_short * at_long * process.kernel((lag + j * self._long - i * self._short) * self.period)
                 total += term
                 size += np.abs(term)
-        total[np.abs(total) < ROUNDING * size] = 0.0
+        total[np.abs(total) < DIFFERENCE_ROUNDING * size] = 0.0
         return total / (self._short * self._long * self.period**2)
 
 
@@ -201,9 +201,9 @@ def _lags(short, long, length):
 
     Dense where one difference begins or ends inside the other, and where the number of pairs of terms in the longest stretch bends.
     """
-    far = 3.0 * GROWTH ** np.arange(1, int(np.log(REACH * float((long / short).max())) / np.log(GROWTH)) + 2)
+    far = 3.0 * LAG_GROWTH ** np.arange(1, int(np.log(MAX_LAG_RATIO * float((long / short).max())) / np.log(LAG_GROWTH)) + 2)
     local = np.concatenate([-far[::-1], DENSE, far])[None, :] * short
-    local = np.clip(local, -REACH * long, REACH * long)
+    local = np.clip(local, -MAX_LAG_RATIO * long, MAX_LAG_RATIO * long)
     first, last = (np.maximum(length - 2 * factor + 1, 0.0) for factor in (short, long))
     bends = [share * end for end in (-first, last - first, last) for share in (0.25, 0.5, 1.0)]
     points = np.concatenate([short - k * long + local for k in range(3)] + bends, axis=1)

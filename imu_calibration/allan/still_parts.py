@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter1d, median_filter
 
 from imu_calibration.core.samples import NominalScaling, SampleBlock, runs_of
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.scan import Chunks, ChunkSeries, still_chunks
+from imu_calibration.preprocessing.scan import CHUNK_SECONDS, Chunks, ChunkSeries, still_chunks
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 
 OUTLIER = 8.0
@@ -20,11 +20,11 @@ FROZEN = 0.05
 """Share of chunks without any scatter from which on an output is coarse."""
 SETTLING = 1.0
 """Kept out on both sides of motion, s."""
-LEAST = 2.0
+MIN_STILL_SECONDS = 2.0
 """Shortest part, s."""
 STEP_WIDTHS = (1, 4, 16, 64)
 """Means of so many chunks are compared: a small step shows only against long ones."""
-NEIGHBOURS = 41
+PERIOD_MEDIAN_CHUNKS = 41
 """Chunks among which a period is the usual one."""
 SAME_PERIOD = 0.02
 """Relative change of the sampling period that ends a part."""
@@ -81,7 +81,7 @@ def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], LeftOut
     parts, short = [], 0.0
     for first, last in _unbroken_runs(shrunk, np.diff(chunks.time) > BRIDGE):
         part = _part(chunks, first, last)
-        if part.seconds >= LEAST:
+        if part.seconds >= MIN_STILL_SECONDS:
             parts.append(part)
         else:
             short += part.seconds
@@ -93,7 +93,7 @@ def _at_the_usual_rate(chunks, period):
     """Return the chunks around which most have the usual period; a chunk with a lost sample is longer, its neighbours are not."""
     if not len(chunks):
         return np.zeros(0, bool)
-    return np.abs(median_filter(chunks.duration / chunks.size, NEIGHBOURS, mode='nearest') / period - 1.0) <= SAME_PERIOD
+    return np.abs(median_filter(chunks.duration / chunks.size, PERIOD_MEDIAN_CHUNKS, mode='nearest') / period - 1.0) <= SAME_PERIOD
 
 
 def _usual(chunks, still):
@@ -165,9 +165,7 @@ def _part(chunks, first, last):
     return StillPart(chunks.first_ns + round(begin * 1e9), chunks.first_ns + round(end * 1e9), slice(int(first), int(last)))
 
 
-CHUNK_TIME = 0.25
-"""s; also the distance at which temperatures are kept."""
-CAPACITY = 1_000_000
+MAX_STILL_CHUNKS = 1_000_000
 """Chunks, nearly three days."""
 
 
@@ -207,7 +205,7 @@ def survey(blocks: Iterable[SampleBlock], nominal: NominalScaling | None = None)
         for epoch, imu in cleaned.imu:
             frame_id = frame_id or imu.frame_id
             columns = np.concatenate([imu.force_s.T, imu.rate_s.T])
-            series.setdefault(epoch, ChunkSeries(CHUNK_TIME, CAPACITY)).push(imu.stamp_ns, columns)
+            series.setdefault(epoch, ChunkSeries(CHUNK_SECONDS, MAX_STILL_CHUNKS)).push(imu.stamp_ns, columns)
         for _, warmth in cleaned.temperature:
             temperature.push(warmth)
     dropped = Counter(cleaner.lost)
@@ -234,7 +232,7 @@ class _Thinned:
     def push(self, samples):
         keep = []
         for k, stamp in enumerate(samples.stamp_ns):
-            if abs(float(stamp) - self._last) >= CHUNK_TIME * 1e9:
+            if abs(float(stamp) - self._last) >= CHUNK_SECONDS * 1e9:
                 keep.append(k)
                 self._last = float(stamp)
         self._stamps.append(samples.stamp_ns[keep])

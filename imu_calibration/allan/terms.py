@@ -22,17 +22,17 @@ FORMS = ((), ('random_walk',), ('bias_instability',), ('gauss_markov',), ('bias_
          ('random_walk', 'gauss_markov'))
 """Slow parts that are tried, a Gauss-Markov process last."""
 PROCESSES = {process.name: process for process in (QUANTISATION, WHITE, FLICKER, RANDOM_WALK)}
-CLOSE = 6.0
+MAX_COST_EXCESS = 6.0
 """Forms whose cost is within this of the least are possible as well."""
 PRICE, PRICE_OF_TIME = 2.0, 7.0
 """Cost of a coefficient, and of a correlation time, for which many are tried."""
 TIME_STEP = 8
 """Stride over the correlation times; each is tested for a clearly higher likelihood than the time of best fit."""
-LEAST_WEIGHT = 0.05
+MIN_FORM_WEIGHT = 0.05
 """Forms less likely than this, against the best, are excluded from intervals."""
-INDEPENDENT = 6.0
+MIN_COMPARED_MEANS = 6.0
 """Forms are compared at averaging times of which the longest part holds so many: with fewer, logarithms are far from Gaussian."""
-CLEAR = 1e-3
+QUANTISATION_P_VALUE = 1e-3
 """Probability below which quantisation is included."""
 
 
@@ -67,7 +67,7 @@ class Choice:
         """Other forms that explain the curve nearly as well, except supersets of a form named before."""
         found: list[FormFit] = []
         for fit in self.fits:
-            if fit.cost - self.best.cost <= CLOSE and not any(_is_part(known.form, fit.form) for known in (self.best, *found)):
+            if fit.cost - self.best.cost <= MAX_COST_EXCESS and not any(_is_part(known.form, fit.form) for known in (self.best, *found)):
                 found.append(fit)
         return tuple(found)
 
@@ -75,7 +75,7 @@ class Choice:
         """Return the fits with a process, the best first, and the likelihood of each relative to it; negligible ones are omitted."""
         found = [fit for fit in self.fits if name in fit.fit.names]
         weights = [1.0, *(float(np.exp(-0.5 * (fit.cost - found[0].cost))) for fit in found[1:])]
-        return [fit.fit for fit, weight in zip(found, weights) if weight > LEAST_WEIGHT], [w for w in weights if w > LEAST_WEIGHT]
+        return [fit.fit for fit, weight in zip(found, weights) if weight > MIN_FORM_WEIGHT], [w for w in weights if w > MIN_FORM_WEIGHT]
 
     def widened(self, name: str) -> 'Choice':
         """Return a choice of one: the best form with a further process."""
@@ -86,7 +86,7 @@ class Choice:
 
     def close(self, name: str) -> FormFit | None:
         """Return the best form with a process among those that explain the curve nearly as well, or None."""
-        near = [fit for fit in self.fits if name in fit.form and fit.cost - self.best.cost <= CLOSE + PRICE_OF_TIME]
+        near = [fit for fit in self.fits if name in fit.form and fit.cost - self.best.cost <= MAX_COST_EXCESS + PRICE_OF_TIME]
         return near[0] if near else None
 
 
@@ -99,7 +99,7 @@ def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
     """Fit every form, with quantisation where the curve shows it; `excess`: factor on all covariances of an unexplained curve."""
     fits = _all_forms(moments, (), excess)
     wider = fit_form(moments, fits[0].form, (QUANTISATION.name,))
-    if score_at_zero(moments, wider.fit, 0) < CLEAR:
+    if score_at_zero(moments, wider.fit, 0) < QUANTISATION_P_VALUE:
         fits = _all_forms(moments, (QUANTISATION.name,), excess)
     return Choice(fits, moments)
 
@@ -126,7 +126,7 @@ def _likeliest(moments, fit):
 
     costs = [at(time)[0] for time in moments.times[::TIME_STEP]]
     best = int(np.argmin(costs))
-    if costs[best] > log_cost(moments, fit) - CLOSE:
+    if costs[best] > log_cost(moments, fit) - MAX_COST_EXCESS:
         return fit
     near = slice(max((best - 1) * TIME_STEP, 0), (best + 1) * TIME_STEP)
     return min((at(time) for time in moments.times[near]), key=lambda found: found[0])[1]
@@ -144,7 +144,7 @@ def log_cost(moments: Moments, fit: MomentFit, excess: float = 1.0) -> float:
 
     Infinite for a fit that expects no variance at some averaging time.
     """
-    some = moments.scales.tau[moments.used] * INDEPENDENT <= moments.scales.longest
+    some = moments.scales.tau[moments.used] * MIN_COMPARED_MEANS <= moments.scales.longest
     expected = (moments.design(fit.processes) @ fit.coefficients)[some]
     covariance = fit.covariance[np.ix_(some, some)]
     if not (np.all(expected > 0) and np.all(np.isfinite(covariance))):
@@ -164,10 +164,10 @@ def without_finest(moments: Moments, count: int) -> Moments:
     return replace(moments, used=used)
 
 
-DETERMINED, WEAK, HELD = 'determined', 'weak', 'held'
+TERM_DETERMINED, TERM_WEAK, TERM_HELD = 'determined', 'weak', 'held'
 DETERMINED_RATIO = 1.6
 """Upper over lower end of the 95 % interval up to which a figure counts as determined: a quarter to either side."""
-MISFIT = 1e-3
+MISFIT_P_VALUE = 1e-3
 """Probability of a misfit below which the shortest averaging times are left out."""
 LEAST_SCALES = 8
 """Least number of averaging times in the fit."""
@@ -175,9 +175,9 @@ LONGEST_LEFT_OUT = 2.0
 """s; a model that fails beyond is wrong for another reason than a filter in the sensor."""
 WHITE_SHARE = 0.5
 """Least share of white noise in the shortest variance for which shorter averaging times of an unexplained curve are excluded."""
-MARGIN = 8.0
+FILTER_TIME_RATIO = 8.0
 """Where a filter shows, averaging times up to so many of the longest that shows it are left out."""
-TIME = 'correlation_time'
+TIME_KEY = 'correlation_time'
 PEAK, PEAK_HEIGHT = 0.371, 0.525
 """Where the Allan variance of a sine peaks, in periods, and how high, in squared amplitudes."""
 RICHEST = tuple((QUANTISATION.name, WHITE.name, *form) for form in ((FLICKER.name, RANDOM_WALK.name), (RANDOM_WALK.name, GAUSS_MARKOV)))
@@ -295,7 +295,7 @@ def fit_range(moments: Moments) -> tuple[Moments, float]:
         trial = without_finest(moments, count)
         freedom = int(trial.used.sum()) - len(RICHEST[0])
         fit = min((fit_names(trial, names) for names in RICHEST), key=lambda found: found.misfit)
-        if chdtrc(freedom, fit.misfit) > MISFIT:
+        if chdtrc(freedom, fit.misfit) > MISFIT_P_VALUE:
             return _with_margin(trial, count, most), 1.0
         seen = fit.coefficient(WHITE.name) * trial.design((WHITE,))[0, 0] > WHITE_SHARE * trial.target[0]
         if not count or (seen and fit.misfit / freedom < least):
@@ -306,7 +306,7 @@ def fit_range(moments: Moments) -> tuple[Moments, float]:
 def _with_margin(moments, count, most):
     """Return the moments without the scales at which a detected filter still bends the curve, by 1 - 3/2 (its time) / tau."""
     tau = moments.scales.tau
-    return without_finest(moments, min(int(np.sum(tau < MARGIN * tau[count])), most)) if count else moments
+    return without_finest(moments, min(int(np.sum(tau < FILTER_TIME_RATIO * tau[count])), most)) if count else moments
 
 
 def _figures(choice, name, excess):
@@ -316,21 +316,21 @@ def _figures(choice, name, excess):
     interval = coefficient_interval(choice.moments, fits, weights, name=name, excess=excess)
     found = {name: _term(name, np.sqrt(fits[0].coefficients[index]), np.sqrt(interval))}
     if name == GAUSS_MARKOV:
-        found[TIME] = _term(TIME, fits[0].processes[index].time, time_interval(choice.moments, fits, weights, excess=excess))
+        found[TIME_KEY] = _term(TIME_KEY, fits[0].processes[index].time, time_interval(choice.moments, fits, weights, excess=excess))
     return found
 
 
 def _term(name, value, interval):
     lower, upper = (float(end) for end in interval)
     if not value > 0:
-        return Term(name, None, (0.0, upper), HELD, 'not seen')
+        return Term(name, None, (0.0, upper), TERM_HELD, 'not seen')
     if lower > 0 and upper / lower <= DETERMINED_RATIO:
-        return Term(name, float(value), (lower, upper), DETERMINED)
-    return Term(name, float(value), (lower, upper), WEAK, 'too short' if lower > 0 else 'may be none')
+        return Term(name, float(value), (lower, upper), TERM_DETERMINED)
+    return Term(name, float(value), (lower, upper), TERM_WEAK, 'too short' if lower > 0 else 'may be none')
 
 
 def _held(term):
-    return replace(term, value=None, status=HELD, interval=(0.0, term.interval[1]),
+    return replace(term, value=None, status=TERM_HELD, interval=(0.0, term.interval[1]),
                    reason='not seen')
 
 
@@ -339,8 +339,8 @@ def _doubted(terms, best, rivals):
     doubted = {}
     for name, term in terms.items():
         without = [rival.form for rival in rivals if name in best.form and name not in rival.form]
-        if without and term.status == DETERMINED:
+        if without and term.status == TERM_DETERMINED:
             other = ' and '.join(without[0]).replace('_', ' ')
-            term = replace(term, status=WEAK, reason=f'{other} fits too')
+            term = replace(term, status=TERM_WEAK, reason=f'{other} fits too')
         doubted[name] = term
     return doubted

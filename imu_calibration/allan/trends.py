@@ -7,16 +7,16 @@ import numpy as np
 
 from imu_calibration.allan.processes import FLICKER, RANDOM_WALK, WHITE, NoiseProcess, mean_covariance
 
-MOST_BLOCKS = 200
-CLEAR = {'temperature': 3.3, 'turn_on': 4.0, 'ramp': 4.0}
+MAX_TREND_BLOCKS = 200
+MIN_TREND_SDS = {'temperature': 3.3, 'turn_on': 4.0, 'ramp': 4.0}
 """A trend counts from this many standard deviations on: 1 in 1000, also with the shapes of turn-on that are tried."""
-LEAST_BLOCKS = 12
+MIN_SPARE_BLOCKS = 12
 """Trends are tested only with this many more blocks than constants."""
 SETTLING_SHARES = (1 / 40, 1 / 20, 1 / 10, 1 / 5)
 """Time constants of turn-on that are tried, as shares of the recording."""
-RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e5, 37)])
+WALK_VARIANCE_RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e5, 37)])
 """Variance of the random walk in the middle of the recording over that of the white noise of a block."""
-TEMPERATURE, TURN_ON, RAMP = 'temperature', 'turn_on', 'ramp'
+TEMPERATURE_TREND, TURN_ON_TREND, RAMP_TREND = 'temperature', 'turn_on', 'ramp'
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +67,9 @@ class TrendReference:
 
 def shape_of(name: str, constant: float = 0.0) -> Callable:
     """Return the regressor of a trend as a function of (time, temperature, reference)."""
-    return {TEMPERATURE: lambda time, warmth, reference: warmth - reference.temperature_c,
-            TURN_ON: lambda time, warmth, reference: np.exp(-(time - reference.begin) / constant),
-            RAMP: lambda time, warmth, reference: time - reference.middle}[name]
+    return {TEMPERATURE_TREND: lambda time, warmth, reference: warmth - reference.temperature_c,
+            TURN_ON_TREND: lambda time, warmth, reference: np.exp(-(time - reference.begin) / constant),
+            RAMP_TREND: lambda time, warmth, reference: time - reference.middle}[name]
 
 
 def _log_determinants(triangles):
@@ -100,13 +100,13 @@ class TrendSearch:
         self._scale = float(np.trace(centred)) / len(lag)
         # Unit white noise and a random walk for each ratio, in a form that needs no variance of the walk.
         centred = self._walk - self._walk[:1] - self._walk[:, :1] + self._walk[0, 0]
-        factors = np.linalg.cholesky(np.eye(len(lag)) + RATIOS[:, None, None] / self._scale * centred)
+        factors = np.linalg.cholesky(np.eye(len(lag)) + WALK_VARIANCE_RATIOS[:, None, None] / self._scale * centred)
         self._inverses, self._logs = np.linalg.inv(factors), _log_determinants(factors)
 
     @property
     def usable(self) -> bool:
         """Whether there are enough blocks."""
-        return len(self.blocks.time) - self._constants.shape[1] >= LEAST_BLOCKS
+        return len(self.blocks.time) - self._constants.shape[1] >= MIN_SPARE_BLOCKS
 
     def find(self, axis: int) -> tuple[AxisTrend, ...]:
         """Return the trends of an axis (0 to 5), the temperature first; none of one that never changes."""
@@ -114,8 +114,8 @@ class TrendSearch:
             return ()
         chosen: list[tuple[str, float]] = []
         while True:
-            asked = [TEMPERATURE] if not chosen and self._warmth_varies() else []
-            found = self._clearest(axis, chosen, asked) or self._clearest(axis, chosen, [TURN_ON, RAMP])
+            asked = [TEMPERATURE_TREND] if not chosen and self._warmth_varies() else []
+            found = self._clearest(axis, chosen, asked) or self._clearest(axis, chosen, [TURN_ON_TREND, RAMP_TREND])
             if found is None:
                 break
             chosen.append(found)
@@ -132,13 +132,13 @@ class TrendSearch:
         span = np.ptp(self.blocks.time) + self.blocks.seconds
         taken = {name for name, _ in chosen}
         tried = [(name, constant) for name in names if name not in taken
-                 for constant in ([share * span for share in SETTLING_SHARES] if name == TURN_ON else [0.0])]
+                 for constant in ([share * span for share in SETTLING_SHARES] if name == TURN_ON_TREND else [0.0])]
         scores = []
         for trial in tried:
             values, sd, _ = self.regress(axis, [*chosen, trial])
             scores.append(abs(values[-1]) / sd[-1])
         best = int(np.argmax(scores)) if scores else None
-        return None if best is None or scores[best] < CLEAR[tried[best][0]] else tried[best]
+        return None if best is None or scores[best] < MIN_TREND_SDS[tried[best][0]] else tried[best]
 
     def columns(self, trends: list[tuple[str, float]]) -> np.ndarray:
         """Return the regressors of (name, time constant), shape (n_blocks, n_trends)."""
@@ -146,7 +146,7 @@ class TrendSearch:
         return np.column_stack([self._constants, *shapes])[:, self._constants.shape[1]:]
 
     def regress(self, axis: int, trends: list[tuple[str, float]]) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return coefficients, their standard deviations, and the index of the likeliest ratio of `RATIOS`."""
+        """Return coefficients, their standard deviations, and the index of the likeliest ratio of `WALK_VARIANCE_RATIOS`."""
         design, target = np.column_stack([self._constants, self.columns(trends)]), self.blocks.mean[:, axis]
         size = np.linalg.norm(design, axis=0)
         basis, triangle = np.linalg.qr(self._inverses @ (design / size))

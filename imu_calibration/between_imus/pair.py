@@ -11,20 +11,20 @@ from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, calibrate_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions
 
-POWER = 6
+SINE_POWER = 6
 """The weight is sin^6: with eight samples per window its sums equal its integrals, and its ends are smooth to fifth order."""
 SAMPLES_LEAST = 8
 """Samples per window; with fewer the sums depend on the positions of the samples."""
-WINDOW = 0.12
+INTEGRATION_SECONDS = 0.12
 """
 Length of the windows over which the motion is integrated, s; never below `SAMPLES_LEAST`. In shorter ones the noise of the angular
 acceleration shortens the arm, in longer ones fast motion averages out.
 """
-GAP = 0.1
+MAX_BRIDGED_SECONDS = 0.1
 """Windows do not bridge longer holes, s; never below five periods."""
 OFFSET_ROUNDS = 4
 """Repeated estimates of the delay between the stamps of the two IMUs."""
-BLOCK = 4_000_000
+MAX_GATHERED_NUMBERS = 4_000_000
 """Numbers per gather operation."""
 
 
@@ -85,13 +85,13 @@ def make_windows(time: np.ndarray, centres: np.ndarray, length: float) -> Window
     phase = np.pi * ((time[index] - centres[:, None]) / length + 0.5)
     sine, share = np.sin(phase), np.gradient(time)[index] / length
     norm = 1 / 0.3125  # the mean of sin^6 over its half period is 5/16
-    weight = np.where(inside, norm * sine**POWER * share, 0.0)
-    slope = np.where(inside, -norm * POWER * np.pi / length * sine**(POWER - 1) * np.cos(phase) * share, 0.0)
+    weight = np.where(inside, norm * sine**SINE_POWER * share, 0.0)
+    slope = np.where(inside, -norm * SINE_POWER * np.pi / length * sine**(SINE_POWER - 1) * np.cos(phase) * share, 0.0)
     return Windows(index, weight, slope)
 
 
 def _weighted(index, weight, values):
-    block = max(1, BLOCK // (index.shape[1] * values.shape[1]))  # bounds memory
+    block = max(1, MAX_GATHERED_NUMBERS // (index.shape[1] * values.shape[1]))  # bounds memory
     parts = [np.einsum('mw,mwk->mk', weight[k:k + block], values[index[k:k + block]]) for k in range(0, len(index), block)]
     return np.concatenate(parts) if parts else np.zeros((0, values.shape[1]))
 
@@ -126,7 +126,7 @@ class PairedImu:
         keep = np.concatenate([[True], np.diff(time) > 0])  # repeated stamps add no new time
         imu, time = imu.select(keep), time[keep]
         period = float(np.median(np.diff(time)))
-        flagged = clipped(imu.force_s) | clipped(imu.rate_s) | holes(time, max(GAP, 5 * period))
+        flagged = clipped(imu.force_s) | clipped(imu.rate_s) | holes(time, max(MAX_BRIDGED_SECONDS, 5 * period))
         still = find_still(imu)
         try:
             calibration = calibrate_by_hand(imu, HandOptions(), still)
@@ -165,7 +165,7 @@ def require_overlap(imu_a: ImuSamples, imu_b: ImuSamples) -> None:
 
 def window_length(a: PairedImu, b: PairedImu) -> float:
     """Return the length of the windows, s."""
-    return max(WINDOW, SAMPLES_LEAST * max(a.period, b.period))
+    return max(INTEGRATION_SECONDS, SAMPLES_LEAST * max(a.period, b.period))
 
 
 def window_centres(a: PairedImu, b: PairedImu, *, offset: float, length: float) -> np.ndarray:

@@ -21,10 +21,10 @@ from imu_calibration.references.gravity.hand_parameters import HandModel
 
 TREMBLING, CREEPING = 1.5e-3, 5e-4
 """m/s^2, rad/s (0.03 deg/s); expected sd of the means of a pose from noise, trembling and creeping hands, before it is estimated."""
-MARGIN = 0.85
+GOAL_SHARE = 0.85
 """Share of the tolerance as goal: the scatter of some twenty poses and turns, a part of every standard deviation, is known to a sixth."""
 MOST_STEPS = 60
-LEAST_GAIN = 1e-3
+MIN_POSE_GAIN = 1e-3
 """Poses with a smaller relative gain are not planned; other information is required, such as the gravity."""
 WEIGHTS = (0.0, 1.0)
 """Exponents of the seconds of a step in its choice: `foretold` tries both."""
@@ -119,7 +119,7 @@ def _rollout(knowledge, weight):
     steps: list[HandStep] = []
     while float(knowledge.missing(knowledge.information)) > 0 and len(steps) < MOST_STEPS:
         step, worth, _ = knowledge.best(weight=weight)
-        if worth.max() < LEAST_GAIN:
+        if worth.max() < MIN_POSE_GAIN:
             break
         steps.append(step)
         knowledge = knowledge.then(step)
@@ -168,7 +168,7 @@ def knowledge_at_first(model: HandModel, tolerances: np.ndarray, *,
     """
     scatter = np.hypot(SCATTER_SD, (TREMBLING, CREEPING, 0.0))
     pose_sd, drift_sd, turn_sd = (float(np.hypot(*pair)) for pair in zip(scatter, noise, strict=True))
-    knowledge = HandKnowledge(model, model.nominal, np.zeros((model.size, model.size)), MARGIN * tolerances, pose_sd, drift_sd, turn_sd,
+    knowledge = HandKnowledge(model, model.nominal, np.zeros((model.size, model.size)), GOAL_SHARE * tolerances, pose_sd, drift_sd, turn_sd,
                               None)
     if poses is None:
         return knowledge
@@ -187,7 +187,7 @@ def knowledge_after(hand: HandCalibration) -> HandKnowledge:
     pose_sd = np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd'])
     drift_sd = np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd'])
     turn_sd = max(statistics['turn_scatter_sd'], 1e-4)
-    return HandKnowledge(model, hand.values, hand.information / wider**2, MARGIN * hand.tolerances,
+    return HandKnowledge(model, hand.values, hand.information / wider**2, GOAL_SHARE * hand.tolerances,
                          float(wider * pose_sd), float(wider * drift_sd), float(wider * turn_sd), ups_of(poses)[-1])
 
 

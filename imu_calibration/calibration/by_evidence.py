@@ -21,7 +21,7 @@ from imu_calibration.document.calibration import one_significant
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BARE, SensorModel
 from imu_calibration.estimation.band_misfit import WEIGHTLESS
-from imu_calibration.estimation.covariance_terms import NOISE
+from imu_calibration.estimation.covariance_terms import SAMPLE_NOISE
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import CONVENTION_SHARE, Solution
 from imu_calibration.estimation.solver import solve
@@ -30,7 +30,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.references.turntable.gathered import Gathered
-from imu_calibration.selection.evidence import LEAST_WINDOWS
+from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.parameter_space import ParameterSpace
 from imu_calibration.selection.questions import Question
@@ -162,7 +162,7 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
 
 def windows_to_ask(gathered: Gathered) -> list[list[Window]]:
     """Return the windows of each recording that suffice for a search of effects, the largest recording first."""
-    return [windows for windows in (spread.windows for spread in gathered.spreads) if len(windows) >= LEAST_WINDOWS]
+    return [windows for windows in (spread.windows for spread in gathered.spreads) if len(windows) >= MIN_FOLD_WINDOWS]
 
 
 def _clipped(found):
@@ -308,7 +308,7 @@ def _with_limit(solution, limit):
         matrix = np.insert(np.insert(matrix, place, 0.0, axis=0), place, 0.0, axis=1)
         matrix[place, place] = corner
         return matrix
-    terms = {name: grown(term, limit.level_sd**2 if name == NOISE else 0.0) for name, term in solution.terms.items()}
+    terms = {name: grown(term, limit.level_sd**2 if name == SAMPLE_NOISE else 0.0) for name, term in solution.terms.items()}
     return replace(solution, model=model, values=np.insert(solution.values, place, limit.level),
                    held=np.insert(solution.held, place, False), terms=terms,
                    information=grown(solution.information, limit.level_sd**-2))

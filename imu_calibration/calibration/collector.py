@@ -38,7 +38,7 @@ from imu_calibration.references.turntable.gathered import (
     owned_window,
 )
 
-FORMAT = 'imu_calibration/accumulator/2'
+SAVED_FORMAT = 'imu_calibration/accumulator/2'
 _MODEL = ('accelerometer', 'gyroscope', 'reference')
 _PLAIN = ('counts', 'frame_id', 'first_stamp_ns', 'last_stamp_ns', 'largest_rate', 'largest_force', 'temperature_c')
 
@@ -58,7 +58,7 @@ def to_bytes(gathered: Gathered, model: SensorModel, demand: Demand = Demand()) 
 
     """
     names = {name: list(getattr(model, name)) for name in (*_MODEL, 'joint_names')}
-    header = {'format': FORMAT, 'model': names | {'joint_errors': model.joint_names.errors},
+    header = {'format': SAVED_FORMAT, 'model': names | {'joint_errors': model.joint_names.errors},
               'effects': model.definitions, 'demand': demand.to_mapping(),
               'temperature_ref_c': model.temperature_ref_c,
               'point': {name: np.asarray(value, float).tolist() for name, value in model.point.items()},
@@ -121,14 +121,14 @@ def _reading(data):
     try:
         with load_arrays(data) as arrays:
             header = json.loads(bytes(arrays['header']).decode())
-            if header.get('format') != FORMAT:
-                raise DocumentError(f"an accumulator must have the format '{FORMAT}', got {shortened(repr(header.get('format')))}; remove "
-                                    'the file')
+            if header.get('format') != SAVED_FORMAT:
+                raise DocumentError(f"an accumulator must have the format '{SAVED_FORMAT}', got "
+                                    f"{shortened(repr(header.get('format')))}; remove the file")
             yield header, arrays
     except ImuCalibrationError:
         raise
     except Exception as error:   # damaged archives, arrays and headers raise many kinds
-        raise DocumentError(f'a saved accumulator must be a whole file of {FORMAT}, this file of {len(data)} bytes is damaged or has '
+        raise DocumentError(f'a saved accumulator must be a whole file of {SAVED_FORMAT}, this file of {len(data)} bytes is damaged or has '
                             f'a different format ({shortened(str(error), 200)}); remove the file', code='accumulator_damaged') from error
 
 

@@ -82,13 +82,13 @@ def waiting_groups(model: SensorModel) -> list[GroupState]:
 
 DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)])
 """Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""
-ENOUGH = 0.02
+MIN_CELL_WORTH = 0.02
 """A cell with a gain below this share of the excess is not proposed for a pose."""
-MOST_MOTIONS, LEAST_GAIN = 20, 0.01
+MAX_MOTIONS_AHEAD, MIN_MOTION_GAIN = 20, 0.01
 """Most standard motions that are planned ahead, and the least share of the excess that the best one must remove."""
 GAUGE_SHOWN = 1e-7
 """m; how exactly the origin is the mean of the sensitive points here."""
-LONGEST = 300.0
+MAX_MOTION_SECONDS = 300.0
 """s; longer standard motions gain too little per second, and their computation is slow."""
 
 
@@ -207,19 +207,19 @@ def _known_before(model):
 
 def _possible_motions(table):
     possible = possible_motions(table)
-    return [motion for motion in (MOTIONS if possible is None else possible) if motion.seconds < LONGEST]
+    return [motion for motion in (MOTIONS if possible is None else possible) if motion.seconds < MAX_MOTION_SECONDS]
 
 
 def _foretold(information, left, added, motions):
     """Return (first motion, seconds of all) of the motions that remove the excess; (None, NaN) if these motions do not suffice."""
     first, seconds, missing = None, 0.0, left(information)
     more = [added(motion) for motion in motions] if missing else []
-    for _ in range(MOST_MOTIONS):
+    for _ in range(MAX_MOTIONS_AHEAD):
         if not missing:
             return first, seconds
         remaining = [left(information + each) for each in more]
         best = max(range(len(motions)), key=lambda k: (missing - remaining[k]) / motions[k].seconds, default=None)
-        if best is None or missing - remaining[best] < LEAST_GAIN * missing:
+        if best is None or missing - remaining[best] < MIN_MOTION_GAIN * missing:
             break
         first, seconds = first or motions[best], seconds + motions[best].seconds
         information, missing = information + more[best], remaining[best]
@@ -262,18 +262,18 @@ RADIUS = 0.5
 """Of the sphere, m; the picture has no scale of its own but that of the arms, which are drawn larger."""
 ARMS_TIMES = 10.0
 """Arms are millimetres."""
-WANTED, VISITED, DONE, ARROW, NOW, WHITE = ((0.95, 0.55, 0.1), (0.25, 0.6, 0.95), (0.2, 0.75, 0.3), (0.9, 0.1, 0.5), (0.5, 0.5, 0.6),
-                                         (0.9, 0.9, 0.9))
-TINY = 0.03
+WANTED, VISITED, DONE_COLOUR, ARROW, NOW, TEXT_COLOUR = (
+    (0.95, 0.55, 0.1), (0.25, 0.6, 0.95), (0.2, 0.75, 0.3), (0.9, 0.1, 0.5), (0.5, 0.5, 0.6), (0.9, 0.9, 0.9))
+SEEN_DIAMETER = 0.03
 
 
 def cells_of(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...], float]]:
     """Yield (place, colour, diameter) of each cell: orange and large where a rest is still worth having, green and small where not."""
-    most = max(float(coverage.worth.max()), ENOUGH)
+    most = max(float(coverage.worth.max()), MIN_CELL_WORTH)
     for direction, worth in zip(DIRECTIONS, coverage.worth, strict=True):
-        share = 0.0 if coverage.done or worth < ENOUGH else float(worth) / most
+        share = 0.0 if coverage.done or worth < MIN_CELL_WORTH else float(worth) / most
         yield RADIUS * direction, tuple(share * wanted + (1 - share) * done
-                                        for wanted, done in zip(WANTED, DONE, strict=True)), 0.06 + 0.1 * share
+                                        for wanted, done in zip(WANTED, DONE_COLOUR, strict=True)), 0.06 + 0.1 * share
 
 
 def line_of(coverage: Coverage) -> str:

@@ -46,8 +46,8 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
         As `solve_by_hand`.
 
     """
-    from imu_calibration.references.gravity.model_selection import POSES_LEAST, investigate_by_hand  # here, because its import is slow
-    if as_asked or len(data.poses.start) < POSES_LEAST:
+    from imu_calibration.references.gravity.model_selection import MIN_FOLD_POSES, investigate_by_hand  # here, because its import is slow
+    if as_asked or len(data.poses.start) < MIN_FOLD_POSES:
         return EvidentHand(solve_by_hand(data, options))
     found, asked = investigate_by_hand(data, options), _asked(data, options)
     while faint := _faint(hand := _solved(data, found, options), found, asked):

@@ -18,7 +18,7 @@ from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.poses import distinct_attitudes
 
-FOLDS = 8
+HAND_PROOF_FOLDS = 8
 """Number of held-out parts."""
 ATTITUDES_LEAST = 10
 """Fewest remaining attitudes when a part is held out: nine parameters of the accelerometer need one equation each."""
@@ -26,7 +26,7 @@ FEW_ATTITUDES = 6
 """Fewest remaining attitudes when one pose is held out: biases and scale factors of the accelerometer need one equation each."""
 TURNS_LEAST = 6
 """Fewest remaining turns, and fewest held-out turns in total."""
-PER_TURN = 'rad per turn'
+TURN_ANGLE_UNIT = 'rad per turn'
 """Unit of the angle between rotated and observed gravity."""
 
 
@@ -61,7 +61,7 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
         return {}
     proof = {'accelerometer': entry_of(_joined(norms), 'm/s^2')}
     if sum(part[0].size for part in angles) >= TURNS_LEAST:
-        proof['gyroscope'] = entry_of(_joined(angles), PER_TURN)
+        proof['gyroscope'] = entry_of(_joined(angles), TURN_ANGLE_UNIT)
     return proof
 
 
@@ -92,7 +92,7 @@ def values_without(hand: HandCalibration, turns: Sequence[TurnData], folds: Sequ
 def _folds(poses):
     """Return masks of the poses to hold out in turn: an eighth of them, or with few attitudes one pose; none with too few."""
     number = np.arange(len(poses.start))
-    for count, least in ((FOLDS, ATTITUDES_LEAST), (len(number), FEW_ATTITUDES)):
+    for count, least in ((HAND_PROOF_FOLDS, ATTITUDES_LEAST), (len(number), FEW_ATTITUDES)):
         folds = [number % count == fold for fold in range(count)]
         if all(distinct_attitudes(poses.force[~out]) >= least for out in folds):
             return folds

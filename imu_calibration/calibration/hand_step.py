@@ -13,7 +13,7 @@ from imu_calibration.effects.base import AXES
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.references.gravity.equations import tangent
 
-HOLD = 3.0
+HOLD_TIME = 3.0
 """s; hold time after which a pose certainly counts."""
 TURN_BEGINS, TURN_RATE = 0.5, 60.0 * DEG
 """s, rad/s; time to begin and to end a turn, and its rate."""
@@ -37,7 +37,7 @@ class HandStep:
     @property
     def seconds(self) -> float:
         """Duration, s."""
-        return HOLD + TURN_BEGINS + (0.5 * np.pi if self.axis is None else self.angle) / TURN_RATE
+        return HOLD_TIME + TURN_BEGINS + (0.5 * np.pi if self.axis is None else self.angle) / TURN_RATE
 
     @property
     def is_turn(self) -> bool:

@@ -10,7 +10,7 @@ from imu_calibration.calibration.advice import missing_motion
 from imu_calibration.calibration.from_solution import document
 from imu_calibration.calibration.hand_by_evidence import EvidentHand, solve_by_evidence
 from imu_calibration.calibration.hand_proof import (
-    PER_TURN,
+    TURN_ANGLE_UNIT,
     TURNS_LEAST,
     entry_of,
     held_out_values,
@@ -25,7 +25,7 @@ from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, NominalScaling, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.effects.base import SENSORS, UNIT, Role
+from imu_calibration.effects.base import SENSORS, UNITS, Role
 from imu_calibration.estimation.solution import with_weak_replaced
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
@@ -275,7 +275,7 @@ def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gra
     (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))
     rested = float(np.sum(poses.stop - poses.start) * poses.period)
     lengths = (np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force))
-    norms, rest = (entry_of(errors, UNIT[sensor]) | {'seconds': rested} for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate))))
+    norms, rest = (entry_of(errors, UNITS[sensor]) | {'seconds': rested} for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate))))
     proof = {'accelerometer': norms | {'regimes': {'rest': norms}}, 'gyroscope': rest | {'regimes': {'rest': rest}}}
     if len(turns) >= TURNS_LEAST:
         up = force / np.linalg.norm(force, axis=1, keepdims=True)
@@ -283,7 +283,7 @@ def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gra
         errors = (np.array([[turn_error(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up=up)]
                             for turn in turns])
                   for imu in (before, after))
-        angles = entry_of(errors, PER_TURN) | {'seconds': float(sum(turn.time[-1] - turn.time[0] for turn in turns))}
+        angles = entry_of(errors, TURN_ANGLE_UNIT) | {'seconds': float(sum(turn.time[-1] - turn.time[0] for turn in turns))}
         proof['gyroscope'] = angles | {'regimes': {'rest': rest, 'turns': angles}}
     return proof
 

@@ -41,7 +41,7 @@ class Derived:
     """Input that would give the same reading, ``matrix^-1 @ bias`` (Zhang 2017, eq. 8), SI, shape (3,)."""
 
 
-PAIRS = ((0, 1), (1, 2), (0, 2))
+AXIS_PAIRS = ((0, 1), (1, 2), (0, 2))
 
 
 def derive(calibration: Calibration, sensor: str) -> Derived:
@@ -64,8 +64,8 @@ def derive(calibration: Calibration, sensor: str) -> Derived:
     scale_sd = np.array([np.sqrt(axes[i] @ blocks[i] @ axes[i]) for i in range(3)])
     spread = [tangent[i] @ blocks[i] @ tangent[i] for i in range(3)]
     angles_sd = np.array([[_angle_sd(axes[i], j, spread[i]) for j in range(3)] for i in range(3)])
-    between = np.array([_angle(axes[i], axes[j]) for i, j in PAIRS])
-    between_sd = np.array([_between_sd(axes, tangent, covariance, i, j) for i, j in PAIRS])
+    between = np.array([_angle(axes[i], axes[j]) for i, j in AXIS_PAIRS])
+    between_sd = np.array([_between_sd(axes, tangent, covariance, i, j) for i, j in AXIS_PAIRS])
     return Derived(sensor, scale, scale_sd, angles_of(axes), angles_sd, between, between_sd, bias, calibration.sd[offset],
                    np.linalg.solve(matrix, bias))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from imu_calibration.calibration.coverage import Coverage, GroupState, group_states, waiting_groups
 from imu_calibration.calibration.hand_workflow import HandRecording, HandResult, calibrate_samples_by_hand
-from imu_calibration.calibration.pose_scan import NOTHING, hand_coverage, hand_status, look_for_poses
+from imu_calibration.calibration.pose_scan import NO_FINDINGS, hand_coverage, hand_status, look_for_poses
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SessionStatus, SolvePacer
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -18,7 +18,7 @@ from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.preprocessing.stamping import StampLine
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 from imu_calibration.preprocessing.window import WindowSettings
-from imu_calibration.references.gravity.hand_calibration import POSES_FULL, POSES_LEAST
+from imu_calibration.references.gravity.hand_calibration import MIN_ATTITUDES, POSES_FULL
 from imu_calibration.references.gravity.hand_options import hand_options
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.sample_store import HandStore
@@ -30,7 +30,7 @@ SEARCH_STEP = 0.5
 """Least duration of new samples between searches for rest, s."""
 _FIRST_NEEDS = {'accelerometer': f'hold it still in {POSES_FULL} different attitudes',
                 'gyroscope': 'turn it from one attitude to the next, within half a minute'}
-MOST_POSES = 200
+MAX_LIVE_POSES = 200
 """The computation time grows with the third power of the number of poses; the oldest are discarded."""
 
 
@@ -70,7 +70,7 @@ class LiveByHand:
             self._store.load(saved)
         self._pacer, self._unsearched, self._reported_ns = SolvePacer(SEARCH_SHARE), 0, None
         self._shown: tuple[tuple, Coverage] | None = None
-        self.found = NOTHING
+        self.found = NO_FINDINGS
         self.result: HandResult | None = None
         self._search(self._store)
 
@@ -133,7 +133,7 @@ class LiveByHand:
             return []
         start, self._unsearched = self._clock(), 0
         self._search(self._store)
-        if self._store.forget(self.found.rests, MOST_POSES):
+        if self._store.forget(self.found.rests, MAX_LIVE_POSES):
             self._search(self._store)
         self._pacer.note(start, self._clock())
         return self._newly_over()
@@ -178,7 +178,7 @@ class LiveByHand:
             store.add(copy.deepcopy(self._check).finish())
         imu = store.samples()
         if imu is None or len(imu) < 3:
-            raise NotObservableError(f'calibration by hand needs {POSES_LEAST} different attitudes at rest, no sample was received; '
+            raise NotObservableError(f'calibration by hand needs {MIN_ATTITUDES} different attitudes at rest, no sample was received; '
                                      'check the topic', code='no_samples')
         self._search(store)
         recording = HandRecording(imu, None, self.counts)

@@ -18,13 +18,13 @@ from imu_calibration.estimation.solution import COMMON_SCALE, LACKING, tolerance
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.gravity.equations import Poses
-from imu_calibration.references.gravity.hand_calibration import POSES_FULL, POSES_LEAST
+from imu_calibration.references.gravity.hand_calibration import MIN_ATTITUDES, POSES_FULL
 from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.poses import average_poses, distinct_attitudes
 from imu_calibration.references.gravity.turns import collect_turns
 
-FACES = {f'{sign}{axis}': direction for axis, unit in zip('xyz', np.eye(3)) for sign, direction in (('+', unit), ('-', -unit))}
+FACE_DIRECTIONS = {f'{sign}{axis}': direction for axis, unit in zip('xyz', np.eye(3)) for sign, direction in (('+', unit), ('-', -unit))}
 """The six directions that can be turned up."""
 FACE_REACH = np.pi / 4
 """A face counts as seen when an attitude lies within this angle of it, rad."""
@@ -48,14 +48,14 @@ class Findings:
     """Duration of the current rest, s; 0 in motion."""
 
 
-NOTHING = Findings([], None, 0, 0, {}, 0.0)
+NO_FINDINGS = Findings([], None, 0, 0, {}, 0.0)
 
 
 def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> Findings:
     """Return the Findings in ImuSamples with rising stamps."""
     rests = [rest for rest in find_still(imu, windows) if rest.stop - rest.start >= 2]
     if not rests:
-        return NOTHING
+        return NO_FINDINGS
     seconds = 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
     poses = average_poses(imu, [(rest.start, rest.stop) for rest in rests])
     turns, dropped = collect_turns(seconds, imu, poses=poses)
@@ -97,16 +97,16 @@ def hand_status(found: Findings, calibration: Calibration | None, *, step: str,
 def unseen(found: Findings) -> list[str]:
     """Return the faces ('+x', ...) that have not been up, the one furthest from all attitudes first."""
     if found.poses is None:
-        return list(FACES)
+        return list(FACE_DIRECTIONS)
     up = found.poses.force / np.linalg.norm(found.poses.force, axis=1, keepdims=True)
-    nearest = {name: float(np.arccos(np.clip(up @ face, -1, 1)).min()) for name, face in FACES.items()}
+    nearest = {name: float(np.arccos(np.clip(up @ face, -1, 1)).min()) for name, face in FACE_DIRECTIONS.items()}
     return sorted((name for name, angle in nearest.items() if angle > FACE_REACH), key=lambda name: -nearest[name])
 
 
 def _needs(found, not_seen, calibration, *, step, hints):
-    if found.attitudes < POSES_LEAST or calibration is None:
+    if found.attitudes < MIN_ATTITUDES or calibration is None:
         more = f' (faces not seen yet: {", ".join(not_seen)})' if not_seen else ''
-        return Progress.WAITING, [f'{step}{more}; {POSES_LEAST} attitudes at least, {POSES_FULL} for all parameters']
+        return Progress.WAITING, [f'{step}{more}; {MIN_ATTITUDES} attitudes at least, {POSES_FULL} for all parameters']
     lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
     if not lacking:
         return Progress.DETERMINED, []

@@ -12,20 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
+from imu_calibration.effects.base import SENSORS, UNITS, Effect, Role
 from imu_calibration.effects.forward_equations import Centre, applied_values, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import one_attitude
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.window_statistics import AXES, PIECE_TIME, Regime
+from imu_calibration.estimation.window_statistics import N_AXES, PIECE_TIME, Regime
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.gathered import HeldOut
 
-RESAMPLES = 1000
+BLOCK_RESAMPLES = 1000
 """Resamples of complete blocks for an interval."""
-LEAST_BLOCKS = 3
+MIN_REGIME_BLOCKS = 3
 """Least blocks for a result in a regime."""
-LARGEST_DELAY = 0.1
+MAX_SEARCHED_DELAY = 0.1
 """Largest delay of the search, s."""
 Side = tuple[HeldOut, Sequence[Sequence[np.ndarray]]]
 
@@ -97,7 +97,7 @@ def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
     blocks = before[0].blocks
     regimes = [name for name in Regime if any(name in block.counts for block in blocks)]
     counts = np.array([[block.counts.get(name, 0) for name in regimes] for block in blocks])
-    if (counts.sum(axis=1) > 0).sum() < LEAST_BLOCKS:
+    if (counts.sum(axis=1) > 0).sum() < MIN_REGIME_BLOCKS:
         return {}
     proof = {}
     for sensor in SENSORS:
@@ -105,9 +105,9 @@ def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
                     for dealt, candidates in (before, after))
         entry = _entry(was.squares.sum(axis=1), now.squares.sum(axis=1), counts.sum(axis=1))
         moving = {str(name): _entry(was.squares[:, k], now.squares[:, k], counts[:, k]) for k, name in enumerate(regimes)
-                  if (counts[:, k] > 0).sum() >= LEAST_BLOCKS}
+                  if (counts[:, k] > 0).sum() >= MIN_REGIME_BLOCKS}
         late = {'delay_s': now.delay, 'delay_explains': 1.0 - now.squares.sum() / max(now.without_delay, 1e-300)}
-        proof[sensor] = entry | {'unit': UNIT[sensor], 'windows': before[0].n_judged} | late | {'regimes': moving}
+        proof[sensor] = entry | {'unit': UNITS[sensor], 'windows': before[0].n_judged} | late | {'regimes': moving}
     return proof
 
 
@@ -176,7 +176,7 @@ def _nuisances(stacked):
     others = changes[1:]
     rest = np.linalg.lstsq(others.T, -error, rcond=1e-9)[0] if len(others) else np.zeros(0)
     without = error + rest @ others
-    best[0] = np.clip(best[0], -LARGEST_DELAY, LARGEST_DELAY)
+    best[0] = np.clip(best[0], -MAX_SEARCHED_DELAY, MAX_SEARCHED_DELAY)
     return best, float(without @ without)
 
 
@@ -196,7 +196,7 @@ class _Correction:
 
     def errors(self, rows):
         """Return errors and their change with each nuisance, (1 + n_nuisances, k, 3): the delay, s, and the arm, m."""
-        columns, slope, output = rows[:, :-2 * AXES], rows[:, -2 * AXES:-AXES], rows[:, -AXES:]
+        columns, slope, output = rows[:, :-2 * N_AXES], rows[:, -2 * N_AXES:-N_AXES], rows[:, -N_AXES:]
         # measured(t) = matrix @ true(t - delay): the error is the delay times the slope.
         parts = [output - columns @ self.total, slope @ self.matrix.T, *(-columns @ arm for arm in self.arms)]
         return np.stack(parts) @ self.inverse.T
@@ -206,7 +206,7 @@ def _entry(before, after, count):
     return compared(before, after, count) | {'seconds': float(count.sum() * PIECE_TIME)}
 
 
-def compared(before: np.ndarray, after: np.ndarray, count: np.ndarray, *, components: int = AXES) -> dict:
+def compared(before: np.ndarray, after: np.ndarray, count: np.ndarray, *, components: int = N_AXES) -> dict:
     """
     Return {'before', 'after', 'ci95'}: rms per component, and the interval of their ratio over resamples of complete blocks.
 
@@ -221,7 +221,7 @@ def compared(before: np.ndarray, after: np.ndarray, count: np.ndarray, *, compon
     """
     held = count > 0
     before, after, count = before[held], after[held], count[held]
-    draw = np.random.default_rng(1).integers(0, len(count), (RESAMPLES, len(count)))
+    draw = np.random.default_rng(1).integers(0, len(count), (BLOCK_RESAMPLES, len(count)))
     with np.errstate(divide='ignore', invalid='ignore'):
         ratio = np.sqrt(after[draw].sum(axis=1) / before[draw].sum(axis=1))
     low, high = np.nan_to_num(np.quantile(ratio, (0.025, 0.975)), nan=1.0, posinf=1e9)

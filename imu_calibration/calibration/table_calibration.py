@@ -40,7 +40,7 @@ from imu_calibration.preprocessing.joint_checks import check_units
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
 from imu_calibration.references.turntable.gathered import Gathered, HeldOut, join, naming
-from imu_calibration.selection.questions import PASSES, at_time_constants, linearise_again
+from imu_calibration.selection.questions import MAX_TABLE_PASSES, at_time_constants, linearise_again
 
 
 def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
@@ -107,7 +107,7 @@ def solve_in_passes(model: SensorModel, options: CalibrationOptions, solved: Cal
     ``solved(model, judged_from)`` returns (Solution, Gathered) with the columns of a model, and windows from that time on for the proof.
     """
     again, judged_from = _at_time_constants(model, options, lambda trial: solved(trial, 0.0)), 0.0
-    for _ in range(PASSES):
+    for _ in range(MAX_TABLE_PASSES):
         model = again
         solution, gathered = solved(model, judged_from)
         again, last_third = linearise_again(model, solution), judged_from_of(solution.model, end_of(gathered.accumulator))

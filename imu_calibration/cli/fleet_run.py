@@ -79,7 +79,7 @@ def unit_of(name: str, paths: Sequence[Path], topics: Topics, *, joint_names: Jo
     return Unit(name, sources, tuple(path.name for path in paths), partial(provenance_of, paths, options))
 
 
-HEADINGS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical_sd', 'spread_over_sd', 'lowest', 'lowest_unit', 'highest',
+CSV_KEYS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical_sd', 'spread_over_sd', 'lowest', 'lowest_unit', 'highest',
             'highest_unit')
 
 
@@ -127,7 +127,7 @@ def _mapper(options, n_units, done):
 
 def parameter_rows(spreads: Sequence[Spread]) -> list[dict[str, Any]]:
     """Return the summary: one row per parameter, SI."""
-    return [dict(zip(HEADINGS, (s.name, s.unit, s.count, s.mean, s.spread, s.typical_sd, s.ratio, *s.lowest, *s.highest))) for s in spreads]
+    return [dict(zip(CSV_KEYS, (s.name, s.unit, s.count, s.mean, s.spread, s.typical_sd, s.ratio, *s.lowest, *s.highest))) for s in spreads]
 
 
 def unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
@@ -149,7 +149,7 @@ def unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
 def csv_text(rows: Sequence[dict[str, Any]]) -> str:
     """Return rows as CSV with a heading; unknown values are empty, and text that a spreadsheet would calculate begins with a quote."""
     text = io.StringIO()
-    written = csv.DictWriter(text, rows[0] if rows else HEADINGS, lineterminator='\n')
+    written = csv.DictWriter(text, rows[0] if rows else CSV_KEYS, lineterminator='\n')
     written.writeheader()
     written.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
     return text.getvalue()
@@ -173,13 +173,13 @@ def shown(spread: Spread) -> tuple[str, ...]:
             f'{spread.lowest[1]} .. {spread.highest[1]}')
 
 
-COLUMNS = ('parameter', 'mean', 'spread', 'typical sd', 'unit', 'spread / sd', 'lowest .. highest unit')
+SPREAD_HEADINGS = ('parameter', 'mean', 'spread', 'typical sd', 'unit', 'spread / sd', 'lowest .. highest unit')
 
 
 def show_fleet(results: Sequence[UnitResult], spreads: Sequence[Spread], folder: Path, *, hints: dict[str, str]) -> None:
     """Print the spread of each parameter, the units, and where the files are."""
     out = Terminal.standard()
-    show_table(out, COLUMNS, map(shown, spreads), numbers=[COLUMNS[k] for k in (1, 2, 3, 5)])
+    show_table(out, SPREAD_HEADINGS, map(shown, spreads), numbers=[SPREAD_HEADINGS[k] for k in (1, 2, 3, 5)])
     for result in results:
         out.print(f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict_text}')
         if result.calibration is not None:
@@ -193,5 +193,5 @@ def summary_html(results: Sequence[UnitResult], spreads: Sequence[Spread]) -> st
     verdicts = [result.verdict for result in results]
     word = HELPS if set(verdicts) == {HELPS} else UNPROVEN if set(verdicts) <= {HELPS, UNPROVEN} else HARMS
     headline = f'the calibration helps both sensors of {verdicts.count(HELPS)} of {len(results)} units'
-    return render('fleet.html', title='Calibration of a fleet', headline=headline, word=word, results=results, columns=COLUMNS,
+    return render('fleet.html', title='Calibration of a fleet', headline=headline, word=word, results=results, columns=SPREAD_HEADINGS,
                   rows=[shown(spread) for spread in spreads])

@@ -88,8 +88,8 @@ def _show_topics(out, looks):
 
 def _show_unread(out, recording, hints):
     """Print the topics that are not read because several fit."""
-    from msg_adapters.bag import KEYS
-    for message_type, key in KEYS.items():
+    from msg_adapters.bag import TOPIC_KEYS
+    for message_type, key in TOPIC_KEYS.items():
         names = [topic.name for topic in recording.topics if topic.type == message_type]
         if names and getattr(recording, key) is None:
             text = f'not read: {", ".join(names)}, no telling which belongs to the IMU; choose one'

@@ -12,9 +12,9 @@ from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-SHARE, RUNNING = '{desc} {percentage:3.0f}% |{bar:40}| {elapsed}', '{desc} |{bar:40}| {elapsed}'
+SHARE_BAR, RUNNING_BAR = '{desc} {percentage:3.0f}% |{bar:40}| {elapsed}', '{desc} |{bar:40}| {elapsed}'
 """Lines of progress with a known and an unknown total."""
-SWEEP, REFRESH = 10, 0.2
+SWEEP, SWEEP_STEP_SECONDS = 10, 0.2
 """Steps and seconds per step of the bar of an unknown total."""
 
 
@@ -45,10 +45,10 @@ class ProgressBars:
             return
         if self._bar is None:
             from tqdm import tqdm
-            self._bar = tqdm(total=SWEEP, bar_format=RUNNING, leave=False, dynamic_ncols=True)
+            self._bar = tqdm(total=SWEEP, bar_format=RUNNING_BAR, leave=False, dynamic_ncols=True)
             self._refresher = threading.Thread(target=self._refresh, name='progress', daemon=True)
             self._refresher.start()
-        self._bar.total, self._bar.bar_format = total or SWEEP, SHARE if total else RUNNING
+        self._bar.total, self._bar.bar_format = total or SWEEP, SHARE_BAR if total else RUNNING_BAR
         if new:
             self._bar.set_description_str(phase, refresh=False)
             self._bar.reset()
@@ -56,8 +56,8 @@ class ProgressBars:
             self._bar.n = min(done, total)
 
     def _refresh(self):
-        while not self._ended.wait(REFRESH):
-            if self._bar.bar_format == RUNNING:
+        while not self._ended.wait(SWEEP_STEP_SECONDS):
+            if self._bar.bar_format == RUNNING_BAR:
                 self._bar.n = (self._bar.n + 1) % (SWEEP + 1)
             self._bar.refresh()
 
@@ -119,11 +119,11 @@ def _interrupted(prog):
     return 130
 
 
-FORMAT = 'imu_calibration/cli/1'
+CLI_FORMAT = 'imu_calibration/cli/1'
 
 
 def json_text(verb: str, exit_code: int, document: Mapping[str, Any]) -> str:
     """Return one JSON document: format, verb, exit code, and the result or the error; numbers that are not finite become null."""
     from imu_calibration.core.documents import json_types
     part = 'error' if 'error' in document else 'result'
-    return json.dumps({'format': FORMAT, 'verb': verb, 'exit_code': exit_code, part: json_types(document)}, allow_nan=False)
+    return json.dumps({'format': CLI_FORMAT, 'verb': verb, 'exit_code': exit_code, part: json_types(document)}, allow_nan=False)

@@ -10,7 +10,7 @@ from textwrap import wrap
 from typing import Any, NamedTuple, NoReturn
 
 import imu_calibration
-from imu_calibration.core.errors import KEYS, did_you_mean
+from imu_calibration.core.errors import ERROR_KEYS, did_you_mean
 
 VERBS = {
     'inspect': 'Topics, rates, gaps, stamps, suspicious units and axes, motions found, and the parameters that the recording determines.',
@@ -117,4 +117,4 @@ def _usage(action):
 
 def hints_of(options: Namespace) -> dict[str, str]:
     """Return {key of an error: option}, of the options that this verb has."""
-    return {key: '--' + key.replace('_', '-') for key in KEYS if key in vars(options)}
+    return {key: '--' + key.replace('_', '-') for key in ERROR_KEYS if key in vars(options)}

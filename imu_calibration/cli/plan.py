@@ -10,7 +10,7 @@ from msg_adapters.storages import identifiers
 
 EXAMPLES = ('--table table.yaml --output plan', '--by-hand --output plan')
 CHOICES = ('tolerances', 'noise', 'accelerometer_model', 'gyroscope_model', 'reference_model', 'catalogue', 'gravity')
-SHOWN = 12
+MAX_PRINTED_MOTIONS = 12
 """Motions that are printed; plan.yaml has all."""
 
 
@@ -94,10 +94,10 @@ def _stand(options):
 def _show(planned, folder):
     from imu_calibration.use_cases.plan import summary
     made = planned.plan
-    for end, motion in list(zip(made.ends, made.motions, strict=True))[:SHOWN]:
+    for end, motion in list(zip(made.ends, made.motions, strict=True))[:MAX_PRINTED_MOTIONS]:
         print(folded(f'until {end:6.1f} s  {motion.words}', ' ' * 16))
-    if len(made.motions) > SHOWN:
-        print(f'... and {len(made.motions) - SHOWN} more, in plan.yaml')
+    if len(made.motions) > MAX_PRINTED_MOTIONS:
+        print(f'... and {len(made.motions) - MAX_PRINTED_MOTIONS} more, in plan.yaml')
     for line in [*summary(made), *planned.notes]:
         print(folded(line, '    '))
     print(f'written: plan.yaml and the trajectory in {folder}')

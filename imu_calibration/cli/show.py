@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from imu_calibration.calibration.result import summary
 from imu_calibration.cli.terminal import STYLES, Terminal
 from imu_calibration.core.errors import printable, with_hint
-from imu_calibration.document.calibration import HEADINGS, NUMBERS, parameter_rows
+from imu_calibration.document.calibration import NUMBER_COLUMNS, PARAMETER_HEADINGS, parameter_rows
 from imu_calibration.preprocessing.recording_evidence import CheckFinding, Severity
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def show_findings(out: Terminal, findings: tuple[CheckFinding, ...], hints: dict
 def show_calibration(found: 'Calibrated', folder: Path, hints: dict[str, str], *, report: bool = True) -> None:
     """Print the parameters of a `Calibrated`, the decisions and where the files are."""
     out = Terminal.standard()
-    show_table(out, HEADINGS, parameter_rows(found.calibration), numbers=NUMBERS)
+    show_table(out, PARAMETER_HEADINGS, parameter_rows(found.calibration), numbers=NUMBER_COLUMNS)
     for line in summary(found.result, hints)[1]:
         out.print(line)
     files = 'calibration.yaml' + (' and report.html' if report else '')

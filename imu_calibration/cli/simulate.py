@@ -10,8 +10,8 @@ from msg_adapters.storages import identifiers
 
 EXAMPLES = ('--effect gyro_g_sensitivity --grade consumer --table table.yaml --output session',
             '--replay recording --calibration result/calibration.yaml --table table.yaml --output simulated')
-NAMES = ('calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_rate', 'joint_rate', 'encoder_resolution_deg',
-         'stamp_jitter_us', 'temperature', 'catalogue')
+SIMULATE_OPTIONS = ('calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_rate', 'joint_rate', 'encoder_resolution_deg',
+                    'stamp_jitter_us', 'temperature', 'catalogue')
 """Options that are arguments of `simulate` by the same name."""
 
 
@@ -47,7 +47,7 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.use_cases.simulate import replay, simulate
     if options.replay is None:
         made = simulate(options.profile, effects=options.effect, table=stand_of(options),
-                        **{name: getattr(options, name) for name in NAMES})
+                        **{name: getattr(options, name) for name in SIMULATE_OPTIONS})
     else:
         if options.calibration is None:
             raise InputError('--replay requires the IMU to simulate, no calibration was given; add --calibration FILE', key='calibration',

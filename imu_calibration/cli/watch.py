@@ -13,7 +13,7 @@ from imu_calibration.core.errors import InputError, printable
 EXAMPLES = ('', '--node /lab/calibration_node --once')
 GONE = 5.0
 """Seconds without a message after which the node counts as ended."""
-PERIOD = 0.25
+WATCH_PERIOD_SECONDS = 0.25
 
 
 def add_arguments(parser: OneLineParser) -> None:
@@ -46,7 +46,7 @@ def _watch(watcher, options):
     """Wait for the node, then show it."""
     end = time.monotonic() + options.patience
     while not watcher.complete and time.monotonic() < end:
-        watcher.spin(PERIOD)
+        watcher.spin(WATCH_PERIOD_SECONDS)
     if not watcher.statuses:
         others = f' (heard: {", ".join(sorted(watcher.others))})' if watcher.others else ''
         raise InputError(f"'{options.node}' must run, no message on /diagnostics in {options.patience:g} s; start it, or name it "
@@ -58,7 +58,7 @@ def _watch(watcher, options):
                                                             for name, s in watcher.statuses.items()}})
     drawn = out.redraw(watcher.screen(out), 0)
     while time.monotonic() - watcher.heard < GONE:
-        watcher.spin(PERIOD)
+        watcher.spin(WATCH_PERIOD_SECONDS)
         drawn = out.redraw(watcher.screen(out), drawn)
     if not out.moves:
         out.write(watcher.screen(out))
@@ -118,9 +118,9 @@ class NodeWatcher:
 
 BAR = 26
 """Characters of a bar."""
-MOST = 1000.0
+FULL_RATIO = 1000.0
 """Times the tolerance at which a bar is full; it is logarithmic."""
-LEAST = 0.1
+EMPTY_RATIO = 0.1
 """Times the tolerance at which it is empty."""
 LEVELS = ('good', 'warning', 'refuse')
 NOT_GROUPS = ('streams', 'calibration', 'poses', 'diagnosis', 'diagnostics', 'planner')
@@ -149,10 +149,10 @@ def ratio_of(status: NodeStatus) -> float:
 
 def bar(ratio: float, width: int = BAR) -> str:
     """Return a bar that shrinks with the uncertainty of a parameter; ``|`` marks its tolerance."""
-    tick = round(width * math.log(1 / LEAST) / math.log(MOST / LEAST))
+    tick = round(width * math.log(1 / EMPTY_RATIO) / math.log(FULL_RATIO / EMPTY_RATIO))
     if math.isnan(ratio):
         return ' ' * tick + '|' + '?' * (width - tick - 1)
-    filled = round(width * min(max(math.log(max(ratio, LEAST) / LEAST) / math.log(MOST / LEAST), 0.0), 1.0))
+    filled = round(width * min(max(math.log(max(ratio, EMPTY_RATIO) / EMPTY_RATIO) / math.log(FULL_RATIO / EMPTY_RATIO), 0.0), 1.0))
     cells = ['#' if k < filled else ' ' for k in range(width)]
     cells[min(tick, width - 1)] = '|'
     return ''.join(cells)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imu_calibration.preprocessing.stamping import MAX_REGULAR_STEP, MIN_REGULAR_STEP
+
 
 @dataclass(frozen=True)
 class CausalDerivative:
@@ -37,7 +39,7 @@ class CausalDerivative:
         return rate_sd * np.sqrt(12.0 / (self.taps * (self.taps**2 - 1.0))) / self.period
 
 
-LARGEST_DELAY = 0.02
+MAX_DERIVATIVE_DELAY = 0.02
 """The window of a derivative does not grow beyond this delay, s."""
 
 
@@ -55,7 +57,7 @@ def choose_derivative(period: float, rate_sd: float, arm: float, *, force_sd: fl
         Longest corrected lever arm, m.
 
     """
-    longest = max(2, int(2 * LARGEST_DELAY / period) + 1)
+    longest = max(2, int(2 * MAX_DERIVATIVE_DELAY / period) + 1)
     if not (rate_sd > 0 and force_sd > 0):
         return CausalDerivative((longest + 2) // 2, period)
     for taps in range(2, longest + 1):
@@ -69,20 +71,12 @@ RESET_NS = 1_000_000_000
 """A larger step back is a reset of the clock, a smaller one a late sample."""
 
 
-REFRESH = 1000
+MAX_SUM_AGE = 1000
 """The running sums are recomputed after this many samples, so that rounding does not accumulate."""
 
 
-EARLY, LATE = 0.5, 1.5
-"""A step between these many periods is a regular one."""
-
-
-WHOLE, MANY = 0.25, 3.5
+WHOLE_GAP_SHARE, MAX_LATE_STEP = 0.25, 3.5
 """A longer step is a gap if it is within this share of a whole number of periods, or longer than this many of them."""
-
-
-WARM_UP = 16
-"""Steps from which the period is found."""
 
 
 class StampedDerivative:
@@ -123,10 +117,10 @@ class StampedDerivative:
         """Return the derivative (x, y, z) after one more sample, per second."""
         if self._newest is not None:
             step = (stamp_ns - self._newest) / self._period_ns
-            if not EARLY < step <= LATE:
+            if not MIN_REGULAR_STEP < step <= MAX_REGULAR_STEP:
                 if step <= 0 and stamp_ns - self._newest > -RESET_NS:
                     return self.alpha
-                if step <= 0 or (step > LATE and abs(step - round(step)) <= WHOLE) or step > MANY:
+                if step <= 0 or (step > MAX_REGULAR_STEP and abs(step - round(step)) <= WHOLE_GAP_SHARE) or step > MAX_LATE_STEP:
                     self._hole(step, x, y, z)
         self._newest = stamp_ns
         self._add(x, y, z)
@@ -151,7 +145,7 @@ class StampedDerivative:
         window.append((x, y, z))
         self._sums = (sx + x, sy + y, sz + z, px + n * x, py + n * y, pz + n * z)
         self._age += 1
-        if self._age >= REFRESH:
+        if self._age >= MAX_SUM_AGE:
             self._refresh()
 
     def _refresh(self):
@@ -183,7 +177,7 @@ class StampedDerivative:
         """Return the derivatives after each of the samples of a block, shape (n, 3): the same as `push` one by one."""
         out = np.empty(values.shape)
         steps = np.diff(stamp_ns) / self._period_ns
-        bounds = np.concatenate([[0], 1 + np.flatnonzero((steps <= EARLY) | (steps > LATE)), [len(values)]])
+        bounds = np.concatenate([[0], 1 + np.flatnonzero((steps <= MIN_REGULAR_STEP) | (steps > MAX_REGULAR_STEP)), [len(values)]])
         for start, end in zip(bounds[:-1].tolist(), bounds[1:].tolist()):
             lead = min(end, start + self.taps + 1)
             for k in range(start, lead):

@@ -57,7 +57,7 @@ class FittedErrors(Protocol):
         """Return (standard deviation of a sample, sd of window offsets and bias process), each shape (3,)."""
 
 
-ITERATIONS = 12
+MAX_INVERSION_STEPS = 12
 """Fixed-point steps at most; each gains the size of the non-linear effects, about three digits."""
 CONVERGED = 1e-2
 """
@@ -192,7 +192,7 @@ def _invert(model, values, force_s, rate_s, alpha_s, beside):
     measured = {'accelerometer': force_s, 'gyroscope': rate_s}
     true = {s: (measured[s] - bias[s]) @ inverse[s].T for s in SENSORS}
     attitude = np.broadcast_to(np.eye(3), (len(force_s), 3, 3))
-    for _ in range(ITERATIONS):
+    for _ in range(MAX_INVERSION_STEPS):
         change = np.zeros(len(force_s))
         for sensor in ('gyroscope', 'accelerometer'):
             ref = Reference(np.zeros(len(force_s)), attitude, true['accelerometer'], true['gyroscope'], alpha_s, 0.0, *beside)

@@ -12,17 +12,17 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import coefficients_at_point, columns_at_point
 from imu_calibration.kinematics.rotations import Reference
 
-STEPS = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-2] * 3)
+DIFFERENCE_STEPS = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-2] * 3)
 """Steps of the central differences in force, rate and derivative of the rate: small against the curvature, large against rounding."""
 
 
-LARGEST = 1e30
+MAX_KNOWN_COVARIANCE = 1e30
 """Covariances from this value on contain no information; below it no arithmetic overflows."""
 
 
 def is_known(covariance: np.ndarray) -> bool:
     """Return whether a covariance from a message is usable: neither NaN nor huge, variances not negative, not all zero."""
-    return bool(np.all(np.abs(covariance) < LARGEST) and np.any(covariance) and np.all(np.diag(covariance) >= 0))
+    return bool(np.all(np.abs(covariance) < MAX_KNOWN_COVARIANCE) and np.any(covariance) and np.all(np.diag(covariance) >= 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ class Uncertainty:
 
         """
         sample, beside = np.concatenate([force, rate, derivative]), (dt, branch, *vibration)
-        gain = np.stack([self._slope(sample, step, beside) for step in np.diag(STEPS)], axis=1)
+        gain = np.stack([self._slope(sample, step, beside) for step in np.diag(DIFFERENCE_STEPS)], axis=1)
         true = self._inside(*sample.tolist(), *beside)
         jacobian = self._parameter_slopes(np.array(true), self._inverse_rate @ sample[6:], beside)
         jacobian = gain[:, :6] @ jacobian

@@ -8,10 +8,10 @@ import numpy as np
 
 from imu_calibration.compensation.compensate import FittedErrors, Transfer
 from imu_calibration.compensation.covariance import Uncertainty
-from imu_calibration.core.units import DEG, STANDARD_GRAVITY, unit_of_rest
+from imu_calibration.core.units import DEG, GRAVITY_PLACE_SHARE, STANDARD_GRAVITY, unit_of_rest
 from imu_calibration.kinematics.rotations import EARTH_RATE
 
-BLOCK = 0.25
+HEALTH_BLOCK_SECONDS = 0.25
 """s; means over it are steady at rest even where a motor shakes the robot."""
 N_BLOCKS = 4
 """Blocks in a row that must agree, one second."""
@@ -19,9 +19,9 @@ MOST_RATE = 0.1
 """rad/s; larger than the rest reading of any gyroscope that is calibrated, so that a faster rotation is no rest."""
 MOST_SHAKE = np.array([0.6] * 3 + [0.06] * 3)
 """Standard deviation within a block, m/s^2 and rad/s: above that of an idling engine, below that of driving over a floor."""
-STEADY = np.array([0.05] * 3 + [3e-3] * 3)
+MAX_BLOCK_CHANGE = np.array([0.05] * 3 + [3e-3] * 3)
 """Largest difference of block means in addition to noise, m/s^2 and rad/s: 0.3 degrees of tilt, 0.2 degrees per second."""
-LONGEST = 30.0
+MAX_STOP_SECONDS = 30.0
 """s; a longer rest counts as several, so that a bias that drifts while the robot is parked is tracked."""
 TIMES_NOISE = 6.0
 """Range of four means of noise, in their standard deviations: exceeded once in ten thousand times by three axes of two sensors."""
@@ -84,8 +84,8 @@ class StopDetector:
 
         """
         rows = np.concatenate([self._rest, rows]) if len(self._rest) else rows
-        while len(rows) and rows[-1, 0] - rows[0, 0] >= BLOCK:
-            n = max(int(np.searchsorted(rows[:, 0], rows[0, 0] + BLOCK)), 1)
+        while len(rows) and rows[-1, 0] - rows[0, 0] >= HEALTH_BLOCK_SECONDS:
+            n = max(int(np.searchsorted(rows[:, 0], rows[0, 0] + HEALTH_BLOCK_SECONDS)), 1)
             self._take(rows[:n])
             rows = rows[n:]
         self._rest = rows
@@ -93,13 +93,13 @@ class StopDetector:
 
     def _take(self, rows):
         """Process one block, or restart after a gap."""
-        if self._blocks and rows[0, 0] - self._blocks[-1][1] > BLOCK:
+        if self._blocks and rows[0, 0] - self._blocks[-1][1] > HEALTH_BLOCK_SECONDS:
             self._blocks, self._stand = [], []
         block = (rows[0, 0], rows[-1, 0], len(rows), rows[:, 1:].mean(axis=0), rows[:, 1:7].var(axis=0))
         self._blocks = [*self._blocks[-N_BLOCKS + 1:], block]
         if not self._may_be_still(*block[3:]) or not self._is_still():
             self._stand = []
-        elif self._stand and block[1] - self._stand[0][0] <= LONGEST:
+        elif self._stand and block[1] - self._stand[0][0] <= MAX_STOP_SECONDS:
             self._stand.append(block)
         else:
             self._stand = [block] if self._stand else list(self._blocks)
@@ -118,7 +118,7 @@ class StopDetector:
         least = min(n for _, _, n, _, _ in self._blocks)
         apart = np.ptp(means, axis=0)
         # Vibration of the robot is noise for the means as well.
-        allowed = STEADY + TIMES_NOISE * np.maximum(self._noise_sd, shake) / np.sqrt(least)
+        allowed = MAX_BLOCK_CHANGE + TIMES_NOISE * np.maximum(self._noise_sd, shake) / np.sqrt(least)
         return bool((apart <= allowed).all() and (shake**2 <= self._most_variance).all())
 
     @staticmethod
@@ -217,10 +217,8 @@ class _State:
 
 LIMIT = 4.0
 """Standard deviations; three axes exceed it by chance once in five thousand calibrations."""
-LEAST = 2.0
+MIN_STOP_SECONDS = 2.0
 """Shortest stop that is tested, s."""
-PLACE = 0.005
-"""Share by which gravity differs between places."""
 WORSE = 1.5
 """Times the error without calibration, from which a calibration does harm rather than too little."""
 
@@ -302,7 +300,7 @@ class CalibrationHealth:
         parameters = Uncertainty(calibration, transfer).at().parameters
         self._known = parameters + np.diag(wander)
         given = options.gravity or calibration.conditions.get('gravity')
-        self._gravity, self._place = float(given or STANDARD_GRAVITY), 0.1 * PLACE if options.gravity else PLACE
+        self._gravity, self._place = float(given or STANDARD_GRAVITY), 0.1 * GRAVITY_PLACE_SHARE if options.gravity else GRAVITY_PLACE_SHARE
         self.update = GyroBiasUpdate(np.sqrt(np.diag(self._known)[3:]), options.bias_time) if options.update else None
         self._judged: float | None = None
         self._last: _Judged | None = None
@@ -317,7 +315,7 @@ class CalibrationHealth:
             Of corrected readings without any update; its `others` are the measured specific force and rate.
 
         """
-        if stop.seconds < LEAST or np.linalg.norm(stop.mean[3:]) > MOST_MOVED:
+        if stop.seconds < MIN_STOP_SECONDS or np.linalg.norm(stop.mean[3:]) > MOST_MOVED:
             return   # too short, or a slow and steady turn
         if self._judged != stop.start:
             self._judged, self.n_stops = stop.start, self.n_stops + 1
@@ -417,7 +415,7 @@ class StopWatch:
             return
         samples = np.array(self._waiting)
         since = int(samples[-1, 0])
-        self._waiting, self._look = [], since + round(1e9 * BLOCK)
+        self._waiting, self._look = [], since + round(1e9 * HEALTH_BLOCK_SECONDS)
         rows = samples[:, AS_STOPS]
         rows[:, 0] *= 1e-9
         stop = self._detector.push(rows)

@@ -11,15 +11,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from imu_calibration.compensation.compensate import CONVERGED, ITERATIONS, FittedErrors, Transfer, invertible_values
+from imu_calibration.compensation.compensate import CONVERGED, MAX_INVERSION_STEPS, FittedErrors, Transfer, invertible_values
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import AXES, LEVER, SENSORS, Role
 from imu_calibration.effects.expressions import SCALAR_FUNCTIONS, added, as_text, scaled
 from imu_calibration.effects.forward_equations import coefficients_at_point
 
-SETTLED = 1e-13
+CONVERGED_CHANGE = 1e-13
 """Sum of the changes in one fixed-point step (m/s^2, rad/s) below which the iteration has converged."""
-LONGEST = 200_000
+MAX_KERNEL_CHARACTERS = 200_000
 """Largest number of characters of a kernel; compiling it needs about a second and 100 MB."""
 BEFOREHAND = {'temperature', 'thermal branch', 'vibration', 'reference temperature'}
 """Quantities of a sample that are available before the correction of either sensor."""
@@ -49,9 +49,9 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     """
     namespace = dict(SCALAR_FUNCTIONS)
     text = kernel_text(calibration, transfer)
-    if len(text) > LONGEST:
-        raise InputError(f'the effects of a calibration must expand to at most {LONGEST} characters of arithmetic, got {len(text)}; '
-                         'use fewer or shorter effects')
+    if len(text) > MAX_KERNEL_CHARACTERS:
+        raise InputError(f'the effects of a calibration must expand to at most {MAX_KERNEL_CHARACTERS} characters of arithmetic, got '
+                         f'{len(text)}; use fewer or shorter effects')
     exec(compile(text, '<compensation kernel>', 'exec'), namespace)
     return namespace['kernel']
 
@@ -114,13 +114,13 @@ def _iteration(accel, gyro):
     """Return the lines that compute the true force in u and the true rate in v, by the same steps as `compensation.compensate`."""
     # ax, ay, az are already in gx, gy, gz: a is the force, b the rate, from matrix and bias only.
     lines = _assigned('a', accel.alone, '    ') + _assigned('b', gyro.alone, '    ')
-    lines += ['    ux, uy, uz, vx, vy, vz = ax, ay, az, bx, by, bz', f'    for _ in range({ITERATIONS}):',
+    lines += ['    ux, uy, uz, vx, vy, vz = ax, ay, az, bx, by, bz', f'    for _ in range({MAX_INVERSION_STEPS}):',
               '        px, py, pz, qx, qy, qz = ux, uy, uz, vx, vy, vz']
     for part, true, alone in ((gyro, 'v', 'b'), (accel, 'u', 'a')):
         if any(part.rest):
             lines += _assigned(true, _less(_vector(alone), part.rest), '        ')
     change = ' + '.join(f'abs({a}{k} - {b}{k})' for a, b in (('u', 'p'), ('v', 'q')) for k in AXES)
-    return lines + [f'        change = {change}', f'        if change < {SETTLED}:', '            break',
+    return lines + [f'        change = {change}', f'        if change < {CONVERGED_CHANGE}:', '            break',
                     f'    if not change < {CONVERGED}:', "        return (float('nan'),) * 6"]
 
 

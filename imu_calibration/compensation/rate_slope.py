@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imu_calibration.compensation.angular_acceleration import EARLY, LATE, RESET_NS, CausalDerivative, StampedDerivative, TimedDerivative
-from imu_calibration.preprocessing.stamping import COUNTED, IRREGULAR, LAG, LEAST, PAUSE_NS, REGULAR, StampLine, describe_stamps
+from imu_calibration.compensation.angular_acceleration import RESET_NS, CausalDerivative, StampedDerivative, TimedDerivative
+from imu_calibration.preprocessing import stamping
+from imu_calibration.preprocessing.stamping import CLOCK_BLOCK, COUNTED, IRREGULAR, LAG, PAUSE_NS, REGULAR, StampLine, describe_stamps
 
-BLOCK = LAG
-"""The stamps are classified again after this many samples."""
-HISTORY = 4 * LAG + 1
+REVIEWED_STAMPS = 4 * LAG + 1
 """Stamps needed to separate counted from irregular stamps."""
 CHANGED = {REGULAR: 0.02, COUNTED: 0.05, IRREGULAR: 0.25}
 """A period that differs by more than this share is a new one; the scatter of the stamps limits the resolution of the latter two."""
@@ -19,7 +18,7 @@ FASTEST_NS = 10_000.0
 """Irregular stamps with a shorter mean step are frozen: they contain no time for a derivative."""
 AGREE = 4
 """Reviews in a row that replace irregular stamps by counted ones: so many blocks contain new stamps only."""
-RECENT = 1.0, 64, 2048
+RECENT_SPAN = 1.0, 64, 2048
 """Seconds, smallest and largest number of samples from which the error of the derivative is estimated."""
 ROUGH = 0.02
 """Seconds over which the rate is compared where there is no derivative: the longest delay that a derivative may have."""
@@ -49,7 +48,7 @@ class RateSlope:
 
     Regular stamps show where samples are missing. Where stamps scatter about a clock (packets, times of arrival, jitter, in any order) the
     samples are counted: `_count_on`. Irregular stamps are used as they are: least squares over the stamped times. Where stamps are frozen
-    the derivative is zero and `error` returns its size. The kind of the stamps is reviewed every `BLOCK` samples.
+    the derivative is zero and `error` returns its size. The kind of the stamps is reviewed every `CLOCK_BLOCK` samples.
 
     Parameters
     ----------
@@ -67,15 +66,15 @@ class RateSlope:
         self.derivative: CausalDerivative | None = None
         """The derivative in use, or None."""
         self._tracker: StampedDerivative | TimedDerivative | None = None
-        self._stamps: deque[int] = deque(maxlen=HISTORY)
-        self._due = LEAST + 1
+        self._stamps: deque[int] = deque(maxlen=REVIEWED_STAMPS)
+        self._due = stamping.MIN_PERIOD_STEPS + 1
         self._newest: int | None = None
         self._reading: tuple = NO_SLOPE
         self._slope: tuple = NO_SLOPE
         self._count, self._longest_ns, self._young = 0, 0.0, True
         self._agreeing, self._ahead_ns = 0, 0
         self._doubtful: list[tuple] = []
-        self._recent: deque[tuple] = deque(maxlen=RECENT[1])
+        self._recent: deque[tuple] = deque(maxlen=RECENT_SPAN[1])
         self._all_of_it: SlopeError | None = None
         self.n_without = 0
         """Samples without a derivative because their stamps are frozen."""
@@ -129,7 +128,7 @@ class RateSlope:
     def settle(self, line: StampLine) -> None:
         """Use the derivative for stamps of that kind; the window is kept while the period is unchanged."""
         self.line, self._doubtful, self._agreeing = line, [], 0
-        self._longest_ns = line.high_ns - line.low_ns + LATE * line.period_ns if line.word == COUNTED else 0.0
+        self._longest_ns = line.high_ns - line.low_ns + stamping.MAX_REGULAR_STEP * line.period_ns if line.word == COUNTED else 0.0
         if isinstance(self._tracker, StampedDerivative) and self._suits(line):
             self._tracker.rebase(round(self._count * 1e9 * self._tracker.period) if self._longest_ns else self._stamps[-2])
             return
@@ -138,7 +137,7 @@ class RateSlope:
         if not _stand_still(line):
             self.derivative = self._choose(line.period_ns * 1e-9)
             self._tracker = (TimedDerivative if line.word == IRREGULAR else StampedDerivative)(self.derivative)
-        seconds, least, most = RECENT
+        seconds, least, most = RECENT_SPAN
         self._recent = deque(maxlen=int(min(max(seconds * 1e9 / line.period_ns, least), most)))
         self._slope, self._young = NO_SLOPE, True
         self._changed()
@@ -172,7 +171,7 @@ class RateSlope:
         change of the stamps, until there is new motion.
         """
         recent = np.array(list(self._recent)).reshape(-1, 3)
-        if len(recent) < LEAST and self._all_of_it is not None:
+        if len(recent) < stamping.MIN_PERIOD_STEPS and self._all_of_it is not None:
             return self._all_of_it
         if self.derivative is None:
             return self._size_of_all(recent)
@@ -223,15 +222,15 @@ class RateSlope:
             self._changed()
         stamps = np.array(self._stamps, np.int64)
         if self.line is None:
-            self._due = LEAST
+            self._due = stamping.MIN_PERIOD_STEPS
             line = describe_stamps(stamps)
         else:
-            self._due = BLOCK
-            if self.line.word == REGULAR and _usual(stamps[-BLOCK - 1:], self.line.period_ns):
+            self._due = CLOCK_BLOCK
+            if self.line.word == REGULAR and _usual(stamps[-CLOCK_BLOCK - 1:], self.line.period_ns):
                 return
             # Counted stamps may appear regular for some time; regular ones are identified at once.
-            line = None if self.line.word == COUNTED else describe_stamps(stamps[-BLOCK - 1:])
-            line = line or (describe_stamps(stamps) if len(stamps) == HISTORY else None)
+            line = None if self.line.word == COUNTED else describe_stamps(stamps[-CLOCK_BLOCK - 1:])
+            line = line or (describe_stamps(stamps) if len(stamps) == REVIEWED_STAMPS else None)
         if line is None:
             if self.line is None:
                 self._changed()   # so that the omitted part is known
@@ -243,28 +242,28 @@ class RateSlope:
         self._agreeing = 0
         if self.line is None or line.word != self.line.word or not self._suits(line):
             self.settle(line)
-        self._due = BLOCK
+        self._due = CLOCK_BLOCK
 
     def _usual_until(self, stamp_ns: np.ndarray, values: np.ndarray, start: int) -> int:
         """Return the number of samples of a block for which only the window moves: no duplicate message, the same class of stamps."""
         if self.line is None or self.line.word != REGULAR:
             return start
-        before = np.array(self._stamps, np.int64)[-BLOCK:]
+        before = np.array(self._stamps, np.int64)[-CLOCK_BLOCK:]
         stamps = np.concatenate([before, stamp_ns[start:]])
         step = np.diff(stamps)
         again = np.flatnonzero(step[max(len(before) - 1, 0):] == 0)   # the counting branch compares their readings
         stop = len(values) - start if not len(again) else int(again[0]) + (0 if len(before) else 1)
-        due = np.arange(self._due - 1, stop, BLOCK)
-        first = due + len(before) - BLOCK
+        due = np.arange(self._due - 1, stop, CLOCK_BLOCK)
+        first = due + len(before) - CLOCK_BLOCK
         unusual = first < 0
-        unusual[~unusual] = ~_usual(stamps[first[~unusual, None] + np.arange(BLOCK + 1)], self.line.period_ns)
+        unusual[~unusual] = ~_usual(stamps[first[~unusual, None] + np.arange(CLOCK_BLOCK + 1)], self.line.period_ns)
         return start + (int(due[unusual][0]) if unusual.any() else stop)
 
     def _note(self, stamp_ns: np.ndarray, reading: np.ndarray, slopes: np.ndarray) -> None:
         """Store the state after a block that was processed as a whole."""
-        self._stamps.extend(stamp_ns[-HISTORY:].tolist())
+        self._stamps.extend(stamp_ns[-REVIEWED_STAMPS:].tolist())
         self._newest, self._reading, self._slope = int(stamp_ns[-1]), tuple(reading.tolist()), tuple(slopes[-1].tolist())
-        self._due = (self._due - len(stamp_ns) - 1) % BLOCK + 1
+        self._due = (self._due - len(stamp_ns) - 1) % CLOCK_BLOCK + 1
         self._recent.extend(map(tuple, slopes[-(self._recent.maxlen or len(slopes)):].tolist()))
 
 
@@ -275,7 +274,7 @@ def _stand_still(line: StampLine) -> bool:
 def _usual(stamps: np.ndarray, period_ns: float) -> np.ndarray:
     """Return whether stamps, shape (..., n), are from a clock of that period, without a missing one."""
     step = np.diff(stamps, axis=-1)
-    within = np.all((step > EARLY * period_ns) & (step <= LATE * period_ns), axis=-1)
+    within = np.all(stamping.is_regular(step, period_ns), axis=-1)
     return within & (np.abs((stamps[..., -1] - stamps[..., 0]) / (period_ns * max(step.shape[-1], 1)) - 1) <= CHANGED[REGULAR])
 
 

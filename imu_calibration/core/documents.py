@@ -17,19 +17,19 @@ import numpy as np
 
 from imu_calibration.core.errors import DocumentError, shortened
 
-LARGEST = 2_000_000
+MAX_DOCUMENT_CHARACTERS = 2_000_000
 """Largest number of characters of a document; the covariance of a hundred parameters has 300 000."""
 MOST_PARTS = 60_000
 """Largest number of numbers, texts, lists and mappings in a document: they are read in half a second."""
-LONGEST = 5000
+MAX_SCALAR_CHARACTERS = 5000
 """Largest number of characters of one text or number; the time of a number in base sixty grows with the square of its length."""
 NO_SUCH_VALUE = (ValueError, OverflowError, TypeError, AttributeError)
 """Exceptions of the parser for malformed dates and numbers."""
-NUMBER, LONGEST_NUMBER = re.compile(r'[-+0-9][0-9_:.a-fxA-F+-]*'), 100
+NUMBER_START, MAX_NUMBER_CHARACTERS = re.compile(r'[-+0-9][0-9_:.a-fxA-F+-]*'), 100
 """Start of a number, and its largest number of characters; larger integers do not fit into a float."""
 FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]{1,3}$')
 """Numbers such as 1e-6 and 1.5e3: the rules of YAML 1.1 require a point and a sign of the exponent; YAML 1.2, ROS and JSON do not."""
-DEEPEST = 20
+MAX_DOCUMENT_DEPTH = 20
 """Deepest nesting of lists and mappings; the stack of a recursive parser overflows well above it."""
 
 
@@ -128,7 +128,7 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
     """
     import yaml
     loader = _with_floats('SafeLoader')
-    _within_limits(len(text), LARGEST, what, 'characters')
+    _within_limits(len(text), MAX_DOCUMENT_CHARACTERS, what, 'characters')
     try:
         _look_through(yaml.parse(text, Loader=loader), what, aliases)
         return yaml.load(text, Loader=loader)
@@ -157,12 +157,12 @@ def _look_through(events, what, aliases):
         if kind == 'ScalarEvent':
             sizes[event.anchor] = 1
             if event.implicit[0] or event.tag:   # false for a quoted text
-                _within_limits(len(event.value), LONGEST, what, 'characters in a row')
-                if NUMBER.fullmatch(event.value):
-                    _within_limits(len(event.value), LONGEST_NUMBER, what, 'characters in a number')
+                _within_limits(len(event.value), MAX_SCALAR_CHARACTERS, what, 'characters in a row')
+                if NUMBER_START.fullmatch(event.value):
+                    _within_limits(len(event.value), MAX_NUMBER_CHARACTERS, what, 'characters in a number')
         elif kind != 'AliasEvent':
             open_parts.append([event.anchor, count, set() if kind == 'MappingStartEvent' else None, True])
-        _within_limits(len(open_parts), DEEPEST, what, 'levels')
+        _within_limits(len(open_parts), MAX_DOCUMENT_DEPTH, what, 'levels')
         _within_limits(count, MOST_PARTS, what, 'parts')
 
 

@@ -1,14 +1,14 @@
 """
 Errors that a user can act on: one line with the requirement, the value received and the remedy.
 
-The core states the requirement. If an input is missing, the error has a key of `KEYS`, and the program that prints the error adds its
+The core states the requirement. If an input is missing, the error has a key of `ERROR_KEYS`, and the program that prints the error adds its
 local name: an option of the command line, a parameter or topic of a node, an argument in a notebook.
 """
 
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-KEYS = {
+ERROR_KEYS = {
     'allow_xacro': 'permission to run a .xacro file',
     'anyway': 'consent to use an unproven calibration', 'calibration': 'the calibration document',
     'columns': 'the columns of a text log', 'diagnose': 'the diagnosis of model errors', 'force': 'consent to overwrite another result',
@@ -22,7 +22,7 @@ KEYS = {
 """Inputs that an error may request, and programs that a remedy may need."""
 OFFERS = {'anyway': ', or give your consent', 'nominal': ', or give a nominal scaling'}
 """Key -> a second remedy, which is offered only where the key has a name."""
-VERBS = {'diagnose': "run 'imu_calibration diagnose' to {}", 'inspect': "run 'imu_calibration inspect' to {}"}
+REMEDY_VERBS = {'diagnose': "run 'imu_calibration diagnose' to {}", 'inspect': "run 'imu_calibration inspect' to {}"}
 """Key -> the program for a remedy, unless the hints name another one."""
 
 
@@ -35,7 +35,7 @@ class ImuCalibrationError(Exception):
     text : str
         Requirement, value received, remedy.
     key : str, optional
-        The missing input, a key of `KEYS`.
+        The missing input, a key of `ERROR_KEYS`.
     code : str
         Stable name of the requirement that is not met, for programs and tests; the text may change.
 
@@ -92,12 +92,12 @@ def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:
     ----------
     text : str
     key : str or None
-        A key of `KEYS`.
+        A key of `ERROR_KEYS`.
     hints : dict
-        Key -> its local name, such as ``{'gravity': "parameter 'gravity'"}``, or for a key of `VERBS` a phrase with ``{}`` for the text;
-        a key without a local name adds nothing.
+        Key -> its local name, such as ``{'gravity': "parameter 'gravity'"}``, or for a key of `REMEDY_VERBS` a phrase with ``{}`` for the
+        text; a key without a local name adds nothing.
 
     """
-    if key in VERBS:
-        return printable(hints.get(key, VERBS[key]).format(text))
+    if key in REMEDY_VERBS:
+        return printable(hints.get(key, REMEDY_VERBS[key]).format(text))
     return printable(f'{text}{OFFERS.get(key, "")} ({hints[key]})' if key in hints else text)

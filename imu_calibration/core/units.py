@@ -8,6 +8,8 @@ STANDARD_GRAVITY = 9.80665
 """m/s^2: the g of people's units, never the gravity of a place."""
 STANDARD_GRAVITY_SD = 0.02
 """Standard deviation of an unknown local gravity, m/s^2."""
+GRAVITY_PLACE_SHARE = 0.005
+"""Share by which gravity differs between places: 9.78 to 9.83 m/s^2."""
 MILLI_G = 1e-3 * STANDARD_GRAVITY
 MICRO_G = 1e-6 * STANDARD_GRAVITY
 HOTTEST_C = 200.0
@@ -17,7 +19,7 @@ DEG_H = DEG / 3600
 ARCMIN = DEG / 60
 
 
-NOISE = 'noise'
+NOISE_QUANTITY = 'noise'
 """The quantity of noise figures, which have the units of data sheets."""
 _SHOWN = {
     '': {'m/s^2': (1e3 / STANDARD_GRAVITY, 'mg'), 'rad/s': (1 / DEG, 'deg/s'), 'm': (1e3, 'mm'), 'rad': (60 / DEG, 'arcmin'),
@@ -27,11 +29,11 @@ _SHOWN = {
          'rad/s/s': (60 / DEG, '(deg/s)/min'), 's/s': (1e6, 'ppm')},
     'accelerometer': {'(m/s^2)^-1': (1e3 * STANDARD_GRAVITY, 'mg/g²'), '(m/s^2)^-2': (1e3 * STANDARD_GRAVITY**2, 'mg/g³')},
     'gyroscope': {'(m/s^2)^-1': (1e2 * STANDARD_GRAVITY, '% per g'), '(m/s^2)^-2': (1e2 * STANDARD_GRAVITY**2, '% per g²')},
-    NOISE: {'m/s^2/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√Hz'), 'm/s^3/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√s'),
-            'm/s^2': (1e6 / STANDARD_GRAVITY, 'µg'), 'm/s': (1e6, 'µm/s'), 'm/s^2/K': (1e6 / STANDARD_GRAVITY, 'µg/K'),
-            'm/s^3': (3600e6 / STANDARD_GRAVITY, 'µg/h'), 'rad/s/sqrt(Hz)': (60 / DEG, 'deg/√h'),
-            'rad/s^2/sqrt(Hz)': (60 * 3600 / DEG, 'deg/h/√h'), 'rad/s': (3600 / DEG, 'deg/h'), 'rad': (3600 / DEG, 'arcsec'),
-            'rad/s/K': (3600 / DEG, '(deg/h)/K'), 'rad/s^2': (3600 * 3600 / DEG, '(deg/h)/h'), 's': (1.0, 's')},
+    NOISE_QUANTITY: {'m/s^2/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√Hz'), 'm/s^3/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√s'),
+                     'm/s^2': (1e6 / STANDARD_GRAVITY, 'µg'), 'm/s': (1e6, 'µm/s'), 'm/s^2/K': (1e6 / STANDARD_GRAVITY, 'µg/K'),
+                     'm/s^3': (3600e6 / STANDARD_GRAVITY, 'µg/h'), 'rad/s/sqrt(Hz)': (60 / DEG, 'deg/√h'),
+                     'rad/s^2/sqrt(Hz)': (60 * 3600 / DEG, 'deg/h/√h'), 'rad/s': (3600 / DEG, 'deg/h'), 'rad': (3600 / DEG, 'arcsec'),
+                     'rad/s/K': (3600 / DEG, '(deg/h)/K'), 'rad/s^2': (3600 * 3600 / DEG, '(deg/h)/h'), 's': (1.0, 's')},
     'time_constant': {'s': (1.0, 's')}, 'time': {'s': (1.0, 's')},
 }
 """Quantity ('' for all), component or sensor -> SI unit -> (factor, customary unit)."""
@@ -55,7 +57,8 @@ def for_people(unit: str, quantity: str = '') -> tuple[float, str]:
     unit : str
         SI unit.
     quantity : str
-        `NOISE`, or a parameter, whose name begins with its sensor: '(m/s^2)^-1' is mg/g² of an accelerometer and % per g of a gyroscope.
+        `NOISE_QUANTITY`, or a parameter, whose name begins with its sensor: '(m/s^2)^-1' is mg/g² of an accelerometer and
+        % per g of a gyroscope.
 
     """
     kinds = (quantity.rpartition('.')[2], quantity.partition('.')[0], '')

@@ -17,7 +17,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.covariance_terms import GRAVITY
 from imu_calibration.estimation.solution import COMMON_SCALE, FIXED, HELD, Status
 
-UNKNOWN = 'unknown'
+UNKNOWN_SD = 'unknown'
 """Entry of the provenance for the uncertainty of imported values."""
 
 
@@ -122,7 +122,7 @@ class Calibration:
     @property
     def uncertainty_known(self) -> bool:
         """Whether the uncertainty of the values is known; that of imported values is not."""
-        return self.provenance.get('uncertainty') != UNKNOWN
+        return self.provenance.get('uncertainty') != UNKNOWN_SD
 
     @property
     def decisions(self) -> dict[str, SensorDecision]:
@@ -174,13 +174,13 @@ class Calibration:
         return as_html(self)
 
 
-HEADINGS = ('parameter', 'value', 'sd', 'unit', 'status')
-NUMBERS = ('value', 'sd')
+PARAMETER_HEADINGS = ('parameter', 'value', 'sd', 'unit', 'status')
+NUMBER_COLUMNS = ('value', 'sd')
 """Columns that are set flush right."""
 
 
 def parameter_rows(calibration: 'Calibration') -> Iterator[tuple[str, ...]]:
-    """Yield the cells of each parameter in the order of `HEADINGS`."""
+    """Yield the cells of each parameter in the order of `PARAMETER_HEADINGS`."""
     for effect in calibration.model.effects:
         part = calibration.model.slices[effect.key]
         for k, index in enumerate(range(part.start, part.stop)):
@@ -201,10 +201,10 @@ def summary(calibration: 'Calibration') -> str:
 
 def as_text(calibration: 'Calibration') -> str:
     """Return the parameters as a table of plain text."""
-    rows = [HEADINGS, *parameter_rows(calibration)]
+    rows = [PARAMETER_HEADINGS, *parameter_rows(calibration)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    aligned = ('  '.join(cell.rjust(width) if heading in NUMBERS else cell.ljust(width)
-                         for cell, width, heading in zip(row, widths, HEADINGS))
+    aligned = ('  '.join(cell.rjust(width) if heading in NUMBER_COLUMNS else cell.ljust(width)
+                         for cell, width, heading in zip(row, widths, PARAMETER_HEADINGS))
                for row in rows)
     return '\n'.join([summary(calibration), *map(str.rstrip, aligned)])
 
@@ -212,10 +212,10 @@ def as_text(calibration: 'Calibration') -> str:
 def as_html(calibration: 'Calibration') -> str:
     """Return the parameters as an HTML table, for notebooks."""
     def row(cells: tuple[str, ...], tag: str) -> str:
-        style = [' style="text-align:right"' if heading in NUMBERS else ' style="text-align:left"' for heading in HEADINGS]
+        style = [' style="text-align:right"' if heading in NUMBER_COLUMNS else ' style="text-align:left"' for heading in PARAMETER_HEADINGS]
         return '<tr>' + ''.join(f'<{tag}{s}>{escape(cell)}</{tag}>' for cell, s in zip(cells, style, strict=True)) + '</tr>'
     body = ''.join(row(cells, 'td') for cells in parameter_rows(calibration))
-    return f'<table><caption>{escape(summary(calibration))}</caption>{row(HEADINGS, "th")}{body}</table>'
+    return f'<table><caption>{escape(summary(calibration))}</caption>{row(PARAMETER_HEADINGS, "th")}{body}</table>'
 
 
 READINGS = {'accelerometer': {'force'}, 'gyroscope': {'rate', 'angular acceleration'}}
@@ -253,7 +253,7 @@ def _stays(effect, sensors):
     return effect.sensor == 'reference' or not any(group.uses & READINGS[sensor] for sensor in sensors for group in effect.groups)
 
 
-MISFIT = 10.0
+MAX_MISFIT_RATIO = 10.0
 """Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
 NOTED_MISFIT = 2.0
 """From this factor on the misfit is worth a note."""
@@ -298,13 +298,13 @@ def listed(names: Sequence[str]) -> str:
 
 LOOK_FOR = {'reference': 'the literature values of tables: check the description of the table, the mount, the stamps'}
 
-ONE = 3.0
+MIN_COEFFICIENT_SDS = 3.0
 """Standard deviations by which one coefficient of an effect must differ from its prior for the effect to be added."""
 
 
 def one_significant(distance: np.ndarray, sd: np.ndarray) -> bool:
-    """Return whether one of several coefficients differs from its prior by more than ONE standard deviations."""
-    return bool(np.any(np.abs(distance) > ONE * sd))
+    """Return whether one of several coefficients differs from its prior by more than MIN_COEFFICIENT_SDS standard deviations."""
+    return bool(np.any(np.abs(distance) > MIN_COEFFICIENT_SDS * sd))
 
 
 DIAGONAL = (0.5, 2.0)

@@ -21,16 +21,16 @@ from imu_calibration.kinematics.joint import JointNames
 
 CONDITION_LIMIT = 20.0
 """A sensor matrix with a larger condition number cannot belong to three independent axes."""
-LARGEST = 1e9
+MAX_VALUE = 1e9
 """Values and standard deviations above this occur with no sensor in any unit; their products would overflow."""
 RANGE_C = (-273.15, 1000.0)
 """Temperatures of a sensor, degrees Celsius."""
-MOST_JOINTS = 30
-ROUNDING = 1e-6
+MAX_DOCUMENT_JOINTS = 30
+COVARIANCE_ROUNDING = 1e-6
 """Tolerance for rounding, relative to the variances, of the test that a covariance is positive semidefinite."""
 
 
-def _is_number(value, low=-LARGEST, high=LARGEST):
+def _is_number(value, low=-MAX_VALUE, high=MAX_VALUE):
     return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
 
 
@@ -73,7 +73,7 @@ def _is_direction(value):
 
 def _is_joint_errors(value):
     return isinstance(value, dict) and all(_is_list_of(_is_text)(value.get(name))
-                                           and len(set(value[name])) == len(value[name]) <= MOST_JOINTS
+                                           and len(set(value[name])) == len(value[name]) <= MAX_DOCUMENT_JOINTS
                                            for name in ('turning', 'zeros', 'angles'))
 
 
@@ -93,7 +93,7 @@ _SECTION = {'effects': _is_list_of(_is_text)}
 KEYS_OF_PARTS = {
     **{section: _SECTION for section in SECTIONS}, 'covariance': {}, 'covariance_terms': {},
     'frame_id': _is_text, 'reference_temperature_c': lambda value: _is_number(value, *RANGE_C),
-    'joint_names': lambda value: _is_list_of(_is_text)(value) and len(set(value)) == len(value) <= MOST_JOINTS,
+    'joint_names': lambda value: _is_list_of(_is_text)(value) and len(set(value)) == len(value) <= MAX_DOCUMENT_JOINTS,
     'effects': {}, 'joint_errors': _or_none(_is_joint_errors), 'gauge': {}, 'provenance': {},
     'undetermined_directions': _or_none(_is_list_of(_is_direction)),
     'statistics': {sensor: _NOISE for sensor in SENSORS},
@@ -147,12 +147,12 @@ def check_numbers(calibration: Calibration) -> Calibration:
         raise DocumentError('every value of a calibration must be a finite number, some are not; calibrate again', code='not_finite')
     if not np.all(values[levels] > 0):
         raise DocumentError('a saturation level must be larger than zero, one is not; calibrate again', code='saturation_level')
-    if max(np.max(np.abs(values[~levels])), math.sqrt(np.max(np.abs(covariance)))) > LARGEST:
-        raise DocumentError(f'values and standard deviations must be below {LARGEST:g}, some are not; calibrate again', code='too_large')
+    if max(np.max(np.abs(values[~levels])), math.sqrt(np.max(np.abs(covariance)))) > MAX_VALUE:
+        raise DocumentError(f'values and standard deviations must be below {MAX_VALUE:g}, some are not; calibrate again', code='too_large')
     _check_covariance(covariance)
     terms, variance = calibration.covariance_terms, np.diag(covariance)
     parts = np.array(list(terms.values()))
-    if terms and not np.all(np.abs(parts.sum(axis=0) - variance) <= ROUNDING * np.abs(parts).sum(axis=0)):
+    if terms and not np.all(np.abs(parts.sum(axis=0) - variance) <= COVARIANCE_ROUNDING * np.abs(parts).sum(axis=0)):
         raise DocumentError('the terms of each variance must sum to it, some do not; calibrate again', code='covariance_terms')
     for sensor in SENSORS:
         for needed in BASE:
@@ -179,7 +179,7 @@ def _check_covariance(covariance):
         raise DocumentError('variances must not be negative, some are; calibrate again', code='negative_variance')
     scale = np.sqrt(np.where(variance > 0, variance, 1.0))
     correlation = covariance / np.outer(scale, scale)
-    if np.max(np.abs(correlation - correlation.T)) > ROUNDING or np.linalg.eigvalsh(correlation)[0] < -ROUNDING:
+    if np.max(np.abs(correlation - correlation.T)) > COVARIANCE_ROUNDING or np.linalg.eigvalsh(correlation)[0] < -COVARIANCE_ROUNDING:
         raise DocumentError('the covariance must be symmetric and positive semidefinite, it is not; calibrate again',
                             code='not_a_covariance')
 
@@ -278,7 +278,7 @@ def _covariance(given, model, entries):
     return np.asarray(given['matrix'], float)[np.ix_(order, order)]
 
 
-FORMAT = 'imu_calibration/1'
+CALIBRATION_FORMAT = 'imu_calibration/1'
 _WHERE_KNOWN = ('decision', 'decision_reasons', 'notes', 'proof')
 """Parts of a document that are omitted while unknown."""
 
@@ -309,7 +309,7 @@ def checked_tolerances(mapping: Any, catalogue: Catalogue = CATALOGUE) -> dict[s
 
 def to_mapping(calibration: Calibration) -> dict:
     """Return the document as plain dicts, lists, floats and strings, in a fixed order."""
-    document: dict[str, Any] = {'format': FORMAT, 'frame_id': calibration.frame_id, 'gauge': dict(calibration.gauge)}
+    document: dict[str, Any] = {'format': CALIBRATION_FORMAT, 'frame_id': calibration.frame_id, 'gauge': dict(calibration.gauge)}
     if calibration.model.definitions:
         document['effects'] = plain(calibration.model.definitions)
     for section in SECTIONS:
@@ -365,7 +365,7 @@ def from_mapping(document: Any) -> Calibration:
     try:
         calibration = Calibration(**parts_of(document))
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, InputError) as error:
-        raise DocumentError(f'a calibration document must have the parts of {FORMAT}, one is missing or has another shape '
+        raise DocumentError(f'a calibration document must have the parts of {CALIBRATION_FORMAT}, one is missing or has another shape '
                             f'({_one_line(error)}); calibrate again', code=getattr(error, 'code', '') or 'document_parts') from error
     return check_numbers(calibration)
 
@@ -377,10 +377,10 @@ def _one_line(error):
 def _check_format(found):
     name, _, number = str(found).partition('/')
     if name != 'imu_calibration' or not number.isdigit():
-        raise DocumentError(f"a calibration document must have 'format: {FORMAT}', got {shortened(repr(found))}; "
+        raise DocumentError(f"a calibration document must have 'format: {CALIBRATION_FORMAT}', got {shortened(repr(found))}; "
                             "give a file written by 'imu_calibration calibrate'", code='document_format')
-    if int(number) > int(FORMAT.partition('/')[2]):
-        raise DocumentError(f"a calibration document must not be newer than '{FORMAT}', got {shortened(repr(found))}; "
+    if int(number) > int(CALIBRATION_FORMAT.partition('/')[2]):
+        raise DocumentError(f"a calibration document must not be newer than '{CALIBRATION_FORMAT}', got {shortened(repr(found))}; "
                             "update imu_calibration", code='document_newer')
 
 

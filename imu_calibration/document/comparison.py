@@ -10,7 +10,7 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.solution import FIXED, HELD
 
-LEVEL = 0.01
+COMPARISON_P_VALUE = 0.01
 """Significance level: two calibrations differ when the p-value is below this."""
 
 
@@ -130,11 +130,11 @@ def _groups(names, difference, covariance, held):
 
 
 def _holm(groups):
-    """Return the groups that are rejected at LEVEL, all groups accounted for."""
+    """Return the groups that are rejected at COMPARISON_P_VALUE, all groups accounted for."""
     rejected = set()
     ordered = sorted(groups, key=lambda g: g[3])
     for k, (name, _, _, probability) in enumerate(ordered):
-        if probability > LEVEL / (len(ordered) - k):
+        if probability > COMPARISON_P_VALUE / (len(ordered) - k):
             break
         rejected.add(name)
     return rejected

@@ -11,9 +11,9 @@ from imu_calibration.effects.base import SENSORS
 
 HARM = 1.05
 """Factor on the error of a regime from which it is named, where the interval lies above 1 too."""
-LATE = 1e-3
+MIN_NAMED_DELAY = 1e-3
 """Delays from this size on are named as a cause, s."""
-AT_REST = 0.7
+REST_SHARE = 0.7
 """An error at rest of at least this share of the total is attributed to the bias."""
 DELAY_SHARE = 0.1
 """A delay is named as a cause where it explains this share of the residual."""
@@ -101,12 +101,12 @@ def ratio_text(entry: Mapping) -> str:
 def _cause(entry):
     """Return the most likely cause as the end of a sentence."""
     late, share = entry.get('delay_s', 0.0), entry.get('delay_explains', 0.0)
-    if abs(late) > LATE and share > DELAY_SHARE:
+    if abs(late) > MIN_NAMED_DELAY and share > DELAY_SHARE:
         side = 'late' if late > 0 else 'early'
         return f'; likely cause: the readings are {abs(late) * 1e3:.0f} ms {side}, which the model does not include'
     regimes = entry.get('regimes') or {}
     rest = regimes.get('rest', {'after': 0.0})
-    if 'rest' in harmed(entry) or rest['after'] > AT_REST * entry['after'] > 0.0 and rest.get('unit', entry['unit']) == entry['unit']:
+    if 'rest' in harmed(entry) or rest['after'] > REST_SHARE * entry['after'] > 0.0 and rest.get('unit', entry['unit']) == entry['unit']:
         return '; likely cause: the bias has changed'
     if regimes and set(harmed(entry)) == {'angular acceleration'}:
         return '; likely cause: the error correlates with angular acceleration: a lever arm, a varying lag, a loose mount'

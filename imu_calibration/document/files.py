@@ -47,7 +47,7 @@ def read_text(path: str | PathLike[str], what: str) -> str:
     """Return the text of a file, or refuse in one line; not more than a document may hold is read."""
     try:
         with io.TextIOWrapper(open_regular(path), encoding='utf-8') as stream:
-            text = stream.read(documents.LARGEST + 1)
+            text = stream.read(documents.MAX_DOCUMENT_CHARACTERS + 1)
     except (OSError, ValueError) as error:
         raise InputError(f'the {what} {path} must be a readable text file: {_why(error)}; correct the path',
                          code='file_unreadable') from error

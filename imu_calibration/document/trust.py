@@ -11,7 +11,7 @@ from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import HAND_AXES, Calibration, beyond_instruments, listed, with_nominal
 from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN, decisions_text, reason_of
-from imu_calibration.effects.base import SENSORS, UNIT, Effect
+from imu_calibration.effects.base import SENSORS, UNITS, Effect
 from imu_calibration.effects.forward_equations import Centre, coefficients, in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
@@ -100,7 +100,7 @@ def columns_at(model: SensorModel, effect: Effect, times: Sequence[float] | np.n
 
 def _size(effect, rms):
     return {'effect': effect.name, 'sensor': effect.sensor, 'applied': END if in_time(effect) else MEAN, 'rms': rms.tolist(),
-            'unit': UNIT[effect.sensor]}
+            'unit': UNITS[effect.sensor]}
 
 
 def uncorrected_lines(statistics: Mapping[str, Any]) -> list[str]:

@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.core.units import for_people, significant
 from imu_calibration.document.calibration import (
     HAND_AXES,
-    MISFIT,
+    MAX_MISFIT_RATIO,
     NOTED_MISFIT,
     SHOWN_NAMES,
     Calibration,
@@ -34,7 +34,7 @@ from imu_calibration.document.decision import (
     worse_regimes,
 )
 from imu_calibration.document.trust import uncorrected_lines
-from imu_calibration.effects.base import SECTIONS, SENSORS, UNIT, Role
+from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
 from imu_calibration.estimation.solution import COMMON_SCALE, DETERMINED, HELD, Status
 from imu_calibration.preprocessing.window import UnusedReason
 
@@ -104,7 +104,7 @@ def _with_size(calibration, name):
 
 def misfits(calibration: Calibration) -> list[Reason]:
     """Return the residuals above the noise at rest: notes, or warnings where they are far above; diagnoses use the same test."""
-    return [Reason(WARNING if ratio > MISFIT else NOTE,
+    return [Reason(WARNING if ratio > MAX_MISFIT_RATIO else NOTE,
                    f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}: '
                    f'the model is incomplete{", although the calibration helps in each regime" if helps else ""}',
                    'find the cause', key='diagnose', sensors=(sensor,))
@@ -119,7 +119,7 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
         part = calibration.model.part(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
         if scatter > tolerances[part][0]:
-            factor, unit = for_people(UNIT[sensor])
+            factor, unit = for_people(UNITS[sensor])
             reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by '
                                         f'{significant(scatter * factor, 2)} {unit}, more than '
                                         'the tolerance on its bias: the mean is well determined, the present bias is not',
@@ -213,7 +213,7 @@ def _reason(calibration, sensor):
 
 def _periodic(calibration, sensor):
     """Return whether held-out windows may repeat an error of the clock: no rests, and residuals far above the noise."""
-    return not rested(calibration) and any(ratio > MISFIT for ratio in misfit_ratios(calibration, sensor).values())
+    return not rested(calibration) and any(ratio > MAX_MISFIT_RATIO for ratio in misfit_ratios(calibration, sensor).values())
 
 
 def _parameters(calibration, within, limiting, *, complete):

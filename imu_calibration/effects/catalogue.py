@@ -16,16 +16,16 @@ from imu_calibration.kinematics.joint import JointNames
 
 JOINT_INPUTS = {'joint angle', 'joint rate'}
 """Quantities that exist only with a table."""
-MOTIONS = (('joint angle', ('static_dense', 'slow_turn')), ('joint rate', ('three_speeds',)),
-           ('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('thermal branch', ('warm_and_cool',)),
-           ('vibration', ('shake',)),
-           ('temperature', ('warm_up',)), ('time', ('warm_up',)),
-           ('rate', ('two_axis', 'three_speeds')), ('force', ('static_dense', 'centrifuge')))
+QUANTITY_MOTIONS = (('joint angle', ('static_dense', 'slow_turn')), ('joint rate', ('three_speeds',)),
+                    ('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('thermal branch', ('warm_and_cool',)),
+                    ('vibration', ('shake',)),
+                    ('temperature', ('warm_up',)), ('time', ('warm_up',)),
+                    ('rate', ('two_axis', 'three_speeds')), ('force', ('static_dense', 'centrifuge')))
 """Standard motions that show a quantity; the first that a column uses applies."""
 DRAWN_AGAINST = {'joint angle': 'angle', 'joint rate': 'angle', 'temperature': 'temperature', 'thermal branch': 'temperature',
                  'time': 'time', 'force': 'force', 'rate': 'rate'}
 """Quantity -> abscissa of the residual plot of a column that uses it; the first applies."""
-MANY = 100.0
+PRIOR_TOLERANCES = 100.0
 """Tolerances in the default standard deviation of the prior."""
 
 
@@ -89,7 +89,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
                   'tolerance_reason': tolerance_reason or None, **numbers}
     if not settles:
         del definition['time_constant']
-    spread = MANY * tolerance if prior_sd is None else prior_sd
+    spread = PRIOR_TOLERANCES * tolerance if prior_sd is None else prior_sd
     needs = ('temperature',) * (thermal or turns) + ('cooling',) * turns
     needs += ('vibration',) * ('vibration' in group.uses)
     needs += ('rotation',) * bool(group.uses & {'rate', 'angular acceleration', 'joint rate'})
@@ -100,7 +100,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
     return Effect(
         name=name, sensor=sensor, **shape, tolerance=tolerance, tolerance_reason=tolerance_reason,
         explanation=_explanation(text, sensor, columns), needs=needs,
-        motion=next((motions for quantity, motions in MOTIONS if quantity in group.uses), ('static_poses',)),
+        motion=next((motions for quantity, motions in QUANTITY_MOTIONS if quantity in group.uses), ('static_poses',)),
         compensation='none' if group.uses & {'time', 'attitude', *JOINT_INPUTS} else 'exact', groups=(group,),
         coefficients=partial(amplitude_coefficients, own_axis=len(columns) == 3),
         smooth=not group.uses - {'time', 'temperature', 'thermal branch', 'reference temperature', 'time constant'},

@@ -13,15 +13,15 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.rotations import Reference
 
-MOST_JOINTS = 7
+MAX_COLUMN_JOINTS = 7
 """Largest number of joints in a column."""
 QUANTITIES: dict[str, dict[str, tuple]] = {
     'force': {f'f_{a}': ('force_s', k) for k, a in enumerate('xyz')},
     'rate': {f'w_{a}': ('rate_s', k) for k, a in enumerate('xyz')},
     'angular acceleration': {f'alpha_{a}': ('alpha_s', k) for k, a in enumerate('xyz')},
     'attitude': {f'c_{a}{b}': ('mat_sn', i, j) for i, a in enumerate('xyz') for j, b in enumerate('xyz')},
-    'joint angle': {f'angle_{k + 1}': ('joint_angle', k) for k in range(MOST_JOINTS)},
-    'joint rate': {f'joint_rate_{k + 1}': ('joint_rate', k) for k in range(MOST_JOINTS)},
+    'joint angle': {f'angle_{k + 1}': ('joint_angle', k) for k in range(MAX_COLUMN_JOINTS)},
+    'joint rate': {f'joint_rate_{k + 1}': ('joint_rate', k) for k in range(MAX_COLUMN_JOINTS)},
     'time': {'time': ('time',)},
     'temperature': {'temperature_c': ('temperature_c',)},
     'thermal branch': {'thermal_branch': ('thermal_branch',)},
@@ -39,11 +39,11 @@ VOCABULARY = ('f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint
 PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
 QUANTITY_OF = {name: quantity for quantity, names in QUANTITIES.items() for name in names}
 FUNCTIONS = ('abs', 'sign', 'sqrt', 'exp', 'expm1', 'log', 'sin', 'cos', 'tanh')
-LONGEST, DEEPEST, HIGHEST_POWER, MOST_PRODUCTS, LARGEST = 400, 30, 9, 200, 1e30
+MAX_CHARACTERS, MAX_COLUMN_DEPTH, MAX_EXPONENT, MAX_PRODUCTS, MAX_COLUMN_NUMBER = 400, 30, 9, 200, 1e30
 """Characters, depth, exponents, products and size of numbers at most, so that no document costs more than arithmetic should."""
 LONGEST_EXPANDED = 5000
 """Characters of a column at most when it is multiplied out: nested powers of a function multiply its text by nine at each level."""
-UNBOUNDED = ('sqrt', 'exp', 'expm1', 'log')
+UNBOUNDED_FUNCTIONS = ('sqrt', 'exp', 'expm1', 'log')
 """Functions without a finite value everywhere."""
 OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
 SIGNS = (ast.UAdd, ast.USub)
@@ -66,8 +66,8 @@ def read(text: str) -> ast.expr:
     """
     try:
         text = ' '.join(text.split())
-        if len(text) > LONGEST:
-            raise _Refused(LONGEST, 'too long')
+        if len(text) > MAX_CHARACTERS:
+            raise _Refused(MAX_CHARACTERS, 'too long')
         if not text.isascii():
             raise _Refused(next(k for k, letter in enumerate(text) if not letter.isascii()), 'a letter that is not ASCII')
         with warnings.catch_warnings():
@@ -92,13 +92,13 @@ class _Refused(Exception):
 
 def _refusal(text, place, why):
     shown = ' '.join(str(text)[place:place + 30].split())
-    return InputError(f'a column must be arithmetic of at most {LONGEST} characters in {VOCABULARY} with {", ".join(FUNCTIONS)} and '
-                      f'powers up to {HIGHEST_POWER}, got {why} at character {place + 1}: {shown!r}; correct it', code='not_arithmetic')
+    return InputError(f'a column must be arithmetic of at most {MAX_CHARACTERS} characters in {VOCABULARY} with {", ".join(FUNCTIONS)} and '
+                      f'powers up to {MAX_EXPONENT}, got {why} at character {place + 1}: {shown!r}; correct it', code='not_arithmetic')
 
 
 def _checked(node, text, depth):
     """Return the node with constants folded into finite floats: an integer could grow without limit, a float raises."""
-    if depth > DEEPEST:
+    if depth > MAX_COLUMN_DEPTH:
         raise _Refused(node.col_offset, 'too many brackets')
 
     def inner(part):
@@ -106,8 +106,8 @@ def _checked(node, text, depth):
     match node:
         case ast.BinOp(left=left, op=op, right=right) if isinstance(op, OPERATORS):
             if isinstance(op, ast.Pow):
-                if not (isinstance(right, ast.Constant) and type(right.value) is int and 0 <= right.value <= HIGHEST_POWER):
-                    raise _Refused(right.col_offset, f'a power that is not an integer up to {HIGHEST_POWER}')
+                if not (isinstance(right, ast.Constant) and type(right.value) is int and 0 <= right.value <= MAX_EXPONENT):
+                    raise _Refused(right.col_offset, f'a power that is not an integer up to {MAX_EXPONENT}')
                 return _folded(ast.BinOp(inner(left), op, right), node)
             return _folded(ast.BinOp(inner(left), op, inner(right)), node)
         case ast.UnaryOp(op=op, operand=operand) if isinstance(op, SIGNS):
@@ -118,7 +118,7 @@ def _checked(node, text, depth):
             return ast.copy_location(ast.Name(name, ast.Load()), node)
         case ast.Name(id=name):
             raise _Refused(node.col_offset, f"the unknown name '{name[:30]}'")
-        case ast.Constant(value=value) if type(value) in (int, float) and abs(value) < LARGEST:
+        case ast.Constant(value=value) if type(value) in (int, float) and abs(value) < MAX_COLUMN_NUMBER:
             return ast.copy_location(ast.Constant(float(value)), node)
     raise _Refused(node.col_offset, 'an operation that is not arithmetic')
 
@@ -132,7 +132,7 @@ def _folded(node, source):
         return ast.copy_location(node, source)
     with np.errstate(all='ignore'):
         value = float(array_function([node])({})[0])
-    if not abs(value) < LARGEST:
+    if not abs(value) < MAX_COLUMN_NUMBER:
         raise _Refused(source.col_offset, 'a number that is not finite')
     return ast.copy_location(ast.Constant(value), source)
 
@@ -146,7 +146,7 @@ def may_fail(tree: ast.expr) -> bool:
     """Return whether a column may be without a finite value somewhere: it divides, or calls a function that is not defined everywhere."""
     divides = any(isinstance(node.op, ast.Div) and not isinstance(node.right, ast.Constant)
                   for node in ast.walk(tree) if isinstance(node, ast.BinOp))
-    return divides or any(called(node) in UNBOUNDED for node in ast.walk(tree) if isinstance(node, ast.Call))
+    return divides or any(called(node) in UNBOUNDED_FUNCTIONS for node in ast.walk(tree) if isinstance(node, ast.Call))
 
 
 def called(node: ast.Call) -> str:
@@ -237,8 +237,8 @@ def scaled(terms: dict[tuple[str, ...], float], factor: float) -> dict[tuple[str
 
 
 def _multiplied(left, right):
-    if len(left) * len(right) > MOST_PRODUCTS:
-        raise InputError(f'a column must have at most {MOST_PRODUCTS} products when it is multiplied out, this one has more; '
+    if len(left) * len(right) > MAX_PRODUCTS:
+        raise InputError(f'a column must have at most {MAX_PRODUCTS} products when it is multiplied out, this one has more; '
                          'write it shorter', code='column_expands')
     result = added(*({tuple(sorted(a + b)): x * y} for a, x in left.items() for b, y in right.items()))
     if sum(len(factor) for factors in result for factor in factors) > LONGEST_EXPANDED:
@@ -268,7 +268,7 @@ SCALAR_FUNCTIONS = {'abs': abs, 'sign': lambda x: (x > 0) - (x < 0), 'divided': 
 """Functions in the expressions of `products`: of plain floats, NaN where undefined."""
 
 
-STEP = 1e-30
+COMPLEX_STEP = 1e-30
 """Complex step of the derivative by a time constant."""
 
 
@@ -349,12 +349,12 @@ class ColumnGroup:
         values['temperature_ref_c'] = np.float64(point.get('temperature_ref_c', 25.0))
         result, count = np.empty((len(ref), self.width)), len(self.text)
         if 'tau' in self.names:
-            values['tau'] = point[self.owner][-1] + 1j * STEP
+            values['tau'] = point[self.owner][-1] + 1j * COMPLEX_STEP
         with np.errstate(all='ignore'):
             for k, column in enumerate(self._function(values)):
                 result[:, k] = np.real(column)
                 if self.width > count:
-                    result[:, count + k] = np.imag(column) / STEP
+                    result[:, count + k] = np.imag(column) / COMPLEX_STEP
         if self.name in point.get('centre', ()):
             result -= point['centre'][self.name]
         if self._may_fail and not np.all(np.isfinite(result)):

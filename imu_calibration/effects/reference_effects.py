@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.effects.base import ATTITUDE, LOAD, MATRIX, PAIRS, SENSORS, SHORT, Effect, Role
+from imu_calibration.effects.base import ATTITUDE, LOAD, MATRIX, PREFIXES, PRODUCT_PAIRS, SENSORS, Effect, Role
 from imu_calibration.kinematics.chain import WOBBLES, tilt, with_axis_angles, with_axis_places, with_sag, with_wobble
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.joint_motion import JointMotion, shifted, with_encoder_harmonics
@@ -34,7 +34,7 @@ def _second_order():
 
 
 SECOND_ORDER = _second_order()
-_KINDS = {
+_LAG_COLUMNS = {
     'bandwidth': ('time_constant', FIRST_ORDER, 'has a first-order low-pass filter: '
                   'its output has a lag and a smaller amplitude at high frequency'),
     'delay': ('delay', ((1.0, 1.0),), 'sends its output late, and the other sensor does not: a pure delay of its own'),
@@ -61,7 +61,7 @@ class _Lag:
 
 
 def _lag_effect(sensor, ending):
-    component, pairs, does = _KINDS[ending]
+    component, pairs, does = _LAG_COLUMNS[ending]
     return Effect(
         name=lag_name(sensor, ending), sensor=sensor, components=(component,), shape=(), unit='s', nonnegative=True, in_reference=True,
         explanation=f'The {sensor} {does}.', tolerance=1e-4, prior_sd=0.1, plausible=(('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),),
@@ -72,10 +72,10 @@ def _lag_effect(sensor, ending):
 
 def lag_name(sensor: str, ending: str) -> str:
     """Return the name of the lag of a sensor: of 'bandwidth', 'delay' or 'filter'."""
-    return f'{SHORT[sensor]}_{ending}'
+    return f'{PREFIXES[sensor]}_{ending}'
 
 
-LAGS = tuple(_lag_effect(sensor, ending) for ending in _KINDS for sensor in SENSORS)
+LAGS = tuple(_lag_effect(sensor, ending) for ending in _LAG_COLUMNS for sensor in SENSORS)
 """
 First-order filter, pure delay and second-order filter of each sensor; collinear where small, separable where large.
 """
@@ -111,8 +111,8 @@ def total_lags(names: Sequence[str], values: np.ndarray, covariance: np.ndarray)
 
 EVEN_AND_ODD = [(i, j, k, 1.0 if (j - i) % 3 == 1 else -1.0) for i in range(3) for j in range(3) for k in range(3) if len({i, j, k}) == 3]
 """Axes i, j, k of a cross product with their sign."""
-_PAIR = {pair: place for place, pair in enumerate(PAIRS)}
-ORDERS = (1, 2)
+_PAIR = {pair: place for place, pair in enumerate(PRODUCT_PAIRS)}
+ENCODER_ORDERS = (1, 2)
 """Harmonics per revolution of the encoder error."""
 
 
@@ -144,9 +144,9 @@ def _columns(table, names):
 
 
 def _harmonics(table, motion, values):
-    amplitudes = np.zeros((motion.position.shape[1], len(ORDERS), 2))
-    amplitudes[_columns(table, table.joint_names.turning)] = np.reshape(values, (-1, len(ORDERS), 2))
-    for index, order in enumerate(ORDERS):
+    amplitudes = np.zeros((motion.position.shape[1], len(ENCODER_ORDERS), 2))
+    amplitudes[_columns(table, table.joint_names.turning)] = np.reshape(values, (-1, len(ENCODER_ORDERS), 2))
+    for index, order in enumerate(ENCODER_ORDERS):
         motion = with_encoder_harmonics(motion, order, amplitudes[:, index, 0], sin_amplitude=amplitudes[:, index, 1])
     return [(1.0, table, motion)]
 
@@ -228,8 +228,8 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             plausible=(('arm', 0.01, 'lengths of arms: 0.1-1 mm after a calibration of their own'),), motion=('two_axis', 'three_speeds'),
             warp=partial(_of_table, with_axis_places), acts_on=('accelerometer',), needs=('joints', 'two_joints', 'dynamic')),
         Effect(
-            **of_table, name='encoder_harmonic', shape=(len(names.turning), len(ORDERS), 2),
-            components=tuple(f'{name}_{kind}{order}' for name in names.turning for order in ORDERS for kind in ('cos', 'sin')),
+            **of_table, name='encoder_harmonic', shape=(len(names.turning), len(ENCODER_ORDERS), 2),
+            components=tuple(f'{name}_{kind}{order}' for name in names.turning for order in ENCODER_ORDERS for kind in ('cos', 'sin')),
             explanation='The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of its disc).',
             tolerance_reason='as the tilt', prior_sd=0.01, plausible=(('bench', 0.01, 'field catalogue 6.3: 10 um on 50 mm is 41 arcsec'),),
             motion=('slow_turn',), warp=_harmonics, needs=('joints',)),

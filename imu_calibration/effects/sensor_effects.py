@@ -10,9 +10,9 @@ from imu_calibration.effects.base import (
     AXES,
     MATRIX,
     OTHERS,
+    PREFIXES,
     PRODUCTS,
-    SHORT,
-    UNIT,
+    UNITS,
     VECTOR,
     Effect,
     Role,
@@ -24,7 +24,7 @@ from imu_calibration.effects.base import (
     product_coefficients,
 )
 
-SHAKEN = 0.05
+VIBRATION_VARIANCE = 0.05
 """Variance of a vibration that is plainly felt, (m/s^2)^2."""
 
 
@@ -38,7 +38,7 @@ def _one_axis(table):
 def _pair(sensor):
     """Return the effects that both sensors have, for one of them."""
     accel = sensor == 'accelerometer'
-    short, kind, unit = SHORT[sensor], base.INPUT[sensor], UNIT[sensor]
+    short, kind, unit = PREFIXES[sensor], base.INPUT[sensor], UNITS[sensor]
     small = MILLI_G if accel else 0.01 * DEG
     full = STANDARD_GRAVITY if accel else 100 * DEG
     own = {group: getattr(base, group)[sensor] for group in ('TRUE_INPUT', 'SQUARES', 'SIGNED', 'THERMAL', 'CHANGE', 'WARM_UP')}
@@ -51,7 +51,7 @@ def _pair(sensor):
             tolerance=small,
             tolerance_reason='1 mg, which tilts a levelled attitude by 1 mrad' if accel else '0.01 deg/s, 0.6 deg of heading a minute',
             prior_sd=2.0 if accel else 0.2, plausible=(('consumer', 1.0 if accel else 0.1, 'field catalogue 6.1, 6.2'),),
-            motion=('static_poses',), compensation='exact', groups=(base.ONE,), coefficients=amplitude_coefficients),
+            motion=('static_poses',), compensation='exact', groups=(base.CONSTANT,), coefficients=amplitude_coefficients),
         Effect(
             name='matrix', sensor=sensor, role=Role.LINEAR, components=MATRIX, shape=(3, 3), unit='1',
             title='matrix (scale factors and axis directions)',
@@ -108,8 +108,8 @@ def _pair(sensor):
             unit=f'{unit}/(m/s^2)^2', against=('time',),
             explanation=f'The {sensor} bias shifts with vibration: even terms of its response rectify it, '
             + ('along the axis of each' if accel else 'of each direction') + ', by this for each variance that is left in the band.',
-            tolerance=small / SHAKEN, tolerance_reason=f'as the bias, at a vibration of {np.sqrt(SHAKEN):.2g} m/s^2 rms',
-            prior_sd=100 * small / SHAKEN,
+            tolerance=small / VIBRATION_VARIANCE, prior_sd=100 * small / VIBRATION_VARIANCE,
+            tolerance_reason=f'as the bias, at a vibration of {np.sqrt(VIBRATION_VARIANCE):.2g} m/s^2 rms',
             plausible=(('consumer', 2.0 if accel else 0.1, ('2 mg/g^2 (ADXL358 data sheet)' if accel else '0.05 deg/s/g^2')
                         + ', where a hundredth of the amplitude is left in the band'),),
             motion=('shake',), compensation='exact', needs=('vibration',), groups=(base.VIBRATION,),

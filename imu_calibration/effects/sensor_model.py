@@ -27,7 +27,7 @@ G_SENSITIVE = (*BASE, 'gyro_g_sensitivity')
 """Gyroscope model by hand when the poses require it."""
 BARE = 'axial'
 """Name of the model from which a diagnosis starts; further effects need evidence."""
-DEFAULT = {'accelerometer': 'size_effect', 'gyroscope': 'rate'}
+DEFAULT_MODEL = {'accelerometer': 'size_effect', 'gyroscope': 'rate'}
 """Default model of a recording on a table."""
 
 

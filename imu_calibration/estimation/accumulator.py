@@ -11,9 +11,9 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import triangular
 from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics
 
-CAPACITY = 4096
+MAX_MEAN_ROWS = 4096
 """Mean rows kept one by one; beyond it the windows are thinned by joining neighbours of the same kind."""
-MOST_BLOCKS = 48
+MAX_ACCUMULATOR_BLOCKS = 48
 """
 Largest number of separate blocks of consecutive windows; beyond it neighbours are joined in pairs, to half this number at least.
 """
@@ -115,7 +115,7 @@ class Accumulator(_CentredRows):
 
     @property
     def _capacity(self):
-        return max(CAPACITY // self.share, LEAST_ROWS)
+        return max(MAX_MEAN_ROWS // self.share, LEAST_ROWS)
 
     def copy(self) -> 'Accumulator':
         """Return an independent copy; rows and factors are never changed in place."""
@@ -150,7 +150,7 @@ class Accumulator(_CentredRows):
         self._join_blocks()
 
     def _join_blocks(self):
-        while len(self.blocks) > MOST_BLOCKS:
+        while len(self.blocks) > MAX_ACCUMULATOR_BLOCKS:
             pairs = [self.blocks[at:at + 2] for at in range(0, len(self.blocks), 2)]
             self.blocks = [pair[0].joined(pair[1]) if len(pair) == 2 else pair[0] for pair in pairs]
             self.block_length *= 2

@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.estimation.noise_model import MovingFactors, NoiseModel
 
-APART = 2.0
+MIN_VARIANCE_RATIO = 2.0
 """The parts have separate weights above this ratio of their residual variances, fast over slow; below it all samples count alike."""
 CAUTIOUS_SDS = 2.0
 """The residual variance of the slow part is raised by this many of its standard deviations, in comparison and use."""
@@ -69,7 +69,7 @@ def band_misfit(total: np.ndarray, dof_total: float, slow: np.ndarray, *, dof_sl
     of_slow = slow / dof_slow
     of_fast = np.maximum(total - slow, 0.0) / max(dof_total - dof_slow, 1)
     cautious = of_slow * (1 + CAUTIOUS_SDS * np.sqrt(2 / dof_slow))
-    apart = of_fast > APART * cautious
+    apart = of_fast > MIN_VARIANCE_RATIO * cautious
     return BandMisfit(overall, np.where(apart, cautious, of_slow), of_fast, apart)
 
 

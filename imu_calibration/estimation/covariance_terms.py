@@ -6,11 +6,11 @@ import numpy as np
 
 Terms = Mapping[str, np.ndarray]
 """Term -> covariance matrix, shape (n_params, n_params)."""
-NOISE = 'noise'
+SAMPLE_NOISE = 'noise'
 """White noise of the samples and of the reference."""
 BIAS_PROCESS = 'bias_process'
 """Bias processes, offsets of windows or poses, and the bias of each recording."""
-HELD = 'held_parameters'
+HELD_PRIORS = 'held_parameters'
 """The uncertainty of priors at which parameters are fixed, and the squared shift of replaced parameters."""
 MODEL_ERROR = 'model_error'
 """Scatter between parts of the recording beyond noise."""
@@ -20,7 +20,7 @@ REJECTED = 'rejected_effects'
 """Effects that were rejected, or are collinear with other effects in the recording."""
 GRAVITY = 'gravity'
 """The uncertainty of the local gravity."""
-EARTH_RATE = 'earth_rate'
+UNMODELLED_EARTH_RATE = 'earth_rate'
 """The Earth's rate, where it is not modelled."""
 
 
@@ -36,7 +36,7 @@ def with_term(terms: Terms, name: str, covariance: np.ndarray) -> dict[str, np.n
 
 def of_fit(terms: Terms) -> np.ndarray:
     """Return the posterior covariance of the fit, without allowances: noise and bias processes."""
-    return total({name: terms[name] for name in (NOISE, BIAS_PROCESS) if name in terms})
+    return total({name: terms[name] for name in (SAMPLE_NOISE, BIAS_PROCESS) if name in terms})
 
 
 def replace_weak(values: np.ndarray, terms: Terms, prior: np.ndarray, *,
@@ -79,4 +79,4 @@ def replace_weak(values: np.ndarray, terms: Terms, prior: np.ndarray, *,
     moved[replaced] = prior[replaced]
     if not replaced.any():
         return values, dict(terms), replaced
-    return moved, with_term(terms, HELD, np.outer(moved - values, moved - values)), replaced
+    return moved, with_term(terms, HELD_PRIORS, np.outer(moved - values, moved - values)), replaced

@@ -21,7 +21,7 @@ from imu_calibration.estimation.row_estimate import RowEstimate, RowSet
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.weighted_system import WeightedSystem
 
-LEAST_BLOCKS = 8
+MIN_SCATTER_BLOCKS = 8
 """Fewest blocks for an estimate of the scatter."""
 MOST_WAVES = 12
 """Number of cosines; faster ones add no information to the scatter within windows."""
@@ -71,7 +71,7 @@ def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, No
         Parameters that were estimated.
 
     """
-    if len(system.accumulator.blocks) < LEAST_BLOCKS or not free.any():
+    if len(system.accumulator.blocks) < MIN_SCATTER_BLOCKS or not free.any():
         return ModelError(np.ones(len(values)), *np.zeros((2, len(values))))
     waves = _waves_of_blocks(*block_scores(system, values, noises), system.prior.root, free)
     found, misfits = errors_of_waves(waves, system.model)

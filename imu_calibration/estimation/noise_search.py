@@ -9,7 +9,7 @@ from scipy.special import ndtri, stdtrit
 from imu_calibration.estimation.noise_model import BiasProcess, dof_factor, means_beside_middles
 from imu_calibration.estimation.whitening import RestrictedLikelihood, profile
 
-STEPS = 2
+SCORING_STEPS = 2
 """Scoring steps per call; for rows of one variance a single step is exact."""
 DOF_LEAST = 2.0
 """With fewer degrees of freedom a group's variance is not estimated from the data."""
@@ -19,7 +19,7 @@ ATTRIBUTION_STEPS = 6
 """Scoring steps for the variance of one group if all misfit is its own."""
 SPARE_LEAST = 0.1
 """With fewer degrees of freedom no misfit is attributed to a group."""
-UPPER = 0.975
+WIDENING_PROBABILITY = 0.975
 """Probability of the quantile whose ratio between Student's t and the normal distribution widens standard deviations."""
 
 
@@ -78,7 +78,7 @@ def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np
     spare = problem.step(large, none)[1]
     free = spare >= DOF_LEAST
     current = np.where(free, start, fallback)
-    for _ in range(STEPS):
+    for _ in range(SCORING_STEPS):
         typical, (changed, dof) = problem.typical(current), problem.step(current, free)
         settled = np.all(np.abs(changed - current) <= 1e-3 * typical)
         current = changed
@@ -93,7 +93,7 @@ def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np
 
 def student_factor(dof: np.ndarray) -> np.ndarray:
     """Return the squared ratio of the 97.5 % quantiles of Student's t with `dof` (at least 1) degrees of freedom and of the normal law."""
-    return (stdtrit(np.maximum(dof, 1.0), UPPER) / ndtri(UPPER))**2
+    return (stdtrit(np.maximum(dof, 1.0), WIDENING_PROBABILITY) / ndtri(WIDENING_PROBABILITY))**2
 
 
 def _attributed(problem, alone, fallback):
@@ -142,9 +142,9 @@ TIME_GRID = np.array([40.0, 100.0, 250.0])
 """Offset and bias process in units of the typical noise of a window mean; correlation times in s."""
 SESSION_GRID = 4.0 ** np.arange(-3, 8)
 """Steps from recording to recording in the same units; the best of them is refined by factors of two and of the root of two."""
-FLICKER, FLICKER_TIMES = 0.0, (1.0, 5.0, 25.0, 125.0, 625.0)
+FLICKER_MARK, FLICKER_TIMES = 0.0, (1.0, 5.0, 25.0, 125.0, 625.0)
 """Correlation time that denotes flicker: equal variance at spaced times, s, from the length of a window to the length of a session."""
-LEAST_WINDOWS = 12
+MIN_PROCESS_WINDOWS = 12
 """Fewest windows for the estimate of a bias process."""
 
 
@@ -171,7 +171,7 @@ class NoiseLikelihood:
                  information: np.ndarray | None = None, known: tuple[BiasProcess, ...] = (), durations: np.ndarray | float = 0.0):
         self._durations = np.broadcast_to(durations, len(rows))
         self.typical = float(np.sqrt(np.median(white)))
-        self.many, self.known = len(rows) >= LEAST_WINDOWS, known
+        self.many, self.known = len(rows) >= MIN_PROCESS_WINDOWS, known
         self._rows, self._white, self._times, self._sessions = rows, white, times, sessions
         self._likelihood, self._losses = RestrictedLikelihood(rows, times, sessions, information=information), {}
         self._profiles = {}
@@ -203,7 +203,7 @@ class NoiseLikelihood:
 
     def processes(self, sd: float, time: float) -> tuple[BiasProcess, ...]:
         """Return the known processes plus one more (or the flicker processes) if its standard deviation is above zero."""
-        times = FLICKER_TIMES if time == FLICKER else (time,)
+        times = FLICKER_TIMES if time == FLICKER_MARK else (time,)
         return (*self.known, *(BiasProcess(sd / float(np.sqrt(len(times))), each) for each in times)) if sd > 0 else self.known
 
 
@@ -308,15 +308,15 @@ def _posterior_mean(trials, costs):
     return float(offset), float(bias), float(np.exp(moving @ np.log(trials[:, 2]) / moving.sum()))
 
 
-TIMES = (100.0, 300.0, 15.0, 40.0, 1000.0, FLICKER)
+CORRELATION_TIMES = (100.0, 300.0, 15.0, 40.0, 1000.0, FLICKER_MARK)
 """Correlation times that are tried, s, and flicker; that of the natural process first."""
 NATURAL = 0.5
 """Least sd of every bias process over the white noise of one second, with the first of these correlation times."""
-SPREAD = 0.8
+BIAS_LOG_SD = 0.8
 """Prior sd of the logarithm of a bias process's sd over the natural one; much larger drifts are hardly a bias process."""
-OFFSETS = 10.0
+OFFSET_PRICE = 10.0
 """Price of offsets of windows: they are no noise of a sensor, and flicker scatters means of windows beyond a wander of 15 s as they do."""
-RATIOS = (0.0, *2.0 ** np.arange(-2.0, 8.5, 0.5))
+SD_RATIOS = (0.0, *2.0 ** np.arange(-2.0, 8.5, 0.5))
 """
 Standard deviations that are tried, in units of the typical noise of a window mean; between steps of two the likelihoods of other times lie.
 """
@@ -344,11 +344,11 @@ class BiasProcessSearch:
         def loss(shape):
             return self.likelihood.loss(shape, used) + self.price(*shape[:2])
 
-        offset = _descend(lambda x: loss((x, self.least, TIMES[0])), RATIOS)
-        shapes = [(offset, self.least, TIMES[0])]
-        grid = (self.least,) + tuple(ratio for ratio in RATIOS if ratio > 1.2 * self.least)
+        offset = _descend(lambda x: loss((x, self.least, CORRELATION_TIMES[0])), SD_RATIOS)
+        shapes = [(offset, self.least, CORRELATION_TIMES[0])]
+        grid = (self.least,) + tuple(ratio for ratio in SD_RATIOS if ratio > 1.2 * self.least)
         if self.likelihood.many:
-            for time in TIMES:
+            for time in CORRELATION_TIMES:
                 bias = _descend(lambda x: loss((0.0, x, time)), grid)
                 shapes += [(_near(share * offset), bias, time) for share in (0.0, 0.25, 0.5, 1.0)]
         shape = min(shapes, key=loss)
@@ -356,13 +356,13 @@ class BiasProcessSearch:
 
     def price(self, offset: float, bias: float) -> float:
         """Return minus twice the log prior of offsets, relative to none, and of the sd of a bias, relative to the usual one."""
-        return OFFSETS * (offset > 0) + ((np.log(max(bias / self.usual, 1.0)) / SPREAD)**2 if self.least else 0.0)
+        return OFFSET_PRICE * (offset > 0) + ((np.log(max(bias / self.usual, 1.0)) / BIAS_LOG_SD)**2 if self.least else 0.0)
 
     def of_middle_axis(self, shape: tuple, used: Sequence[int]) -> float:
         """Return the median over the axes of the likeliest sd of the bias process of each, with `shape` for the other axes."""
         def likeliest(own):
             offset = shape[0] * self.likelihood.typical / own.typical
-            return own.typical * _descend(lambda x: own.loss((offset, x, shape[2]), used), RATIOS)
+            return own.typical * _descend(lambda x: own.loss((offset, x, shape[2]), used), SD_RATIOS)
 
         return float(np.median([likeliest(self.likelihood.of_axis(axis, shape)) for axis in range(3)]))
 
@@ -377,7 +377,7 @@ class BiasProcessSearch:
 
 def _near(ratio):
     """Return the tried ratio that is nearest, so that shapes are met again."""
-    return min(RATIOS, key=lambda known: abs(known - ratio))
+    return min(SD_RATIOS, key=lambda known: abs(known - ratio))
 
 
 def _descend(loss: Callable, grid):

@@ -9,6 +9,7 @@ import scipy.linalg
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
+from imu_calibration.effects.sensor_effects import VIBRATION_VARIANCE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal
@@ -18,7 +19,7 @@ from imu_calibration.kinematics.signal_history import ThermalBranch
 
 REST, WAY = 5.0, 3.0
 """s; a rest, and the time from one rest to the next."""
-ALONG = 0.98
+MIN_AXIS_COSINE = 0.98
 """Cosine of the angle up to which a joint lies along a sensor axis."""
 OTHER_MOUNT = 'mount the IMU at a different angle on the joint and record the same motion again, in addition to this recording'
 """Advice when further motions of a single joint do not help."""
@@ -65,27 +66,25 @@ def _attitudes(up_s):
     return np.stack([first, np.cross(up_s, first), up_s], axis=2)
 
 
-TIME = np.arange(0.0, 30.0, 0.02)
-SHAKEN = 0.05
-"""Residual variance of a machine's vibration in the band, (m/s^2)^2."""
+MOTION_TIME = np.arange(0.0, 30.0, 0.02)
 
 
-EDGES = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
+POSE_DIRECTIONS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
 
 
 def _spin(axis, speeds, up=None, arm=None):
     def make(gravity):
         across = np.roll(axis, 1) if up is None else up
-        return [_turn(axis, TIME, s * DEG * TIME, np.full(len(TIME), s * DEG), np.zeros(len(TIME)), gravity, across, arm=arm)
-                for s in speeds]
+        return [_turn(axis, MOTION_TIME, s * DEG * MOTION_TIME, np.full(len(MOTION_TIME), s * DEG), np.zeros(len(MOTION_TIME)), gravity,
+                      across, arm=arm) for s in speeds]
     return make
 
 
 def _oscillation(axis, degrees, hertz, up=None):
     def make(gravity):
         w, a = 2 * np.pi * hertz, degrees * DEG
-        return [_turn(axis, TIME, a * np.sin(w * TIME), a * w * np.cos(w * TIME), -a * w**2 * np.sin(w * TIME), gravity,
-                      (0.3, 0.4, 1.0) if up is None else up)]
+        return [_turn(axis, MOTION_TIME, a * np.sin(w * MOTION_TIME), a * w * np.cos(w * MOTION_TIME), -a * w**2 * np.sin(w * MOTION_TIME),
+                      gravity, (0.3, 0.4, 1.0) if up is None else up)]
     return make
 
 
@@ -101,7 +100,7 @@ def _poses(directions, temperatures=(None,)):
 
 def _shaken(gravity):
     """Rest in six faces, quiet and while the sensor is shaken along each axis."""
-    one, shakes = np.zeros(1), (np.zeros(3), *SHAKEN * np.eye(3))
+    one, shakes = np.zeros(1), (np.zeros(3), *VIBRATION_VARIANCE * np.eye(3))
     return [_turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, shaking=shaking)
             for shaking in shakes for k, up in enumerate(sign * row for row in np.eye(3) for sign in (1, -1))]
 
@@ -116,14 +115,14 @@ def _two_axis(gravity):
     pieces = []
     for inner, outer in ((0, 1), (1, 2), (2, 0)):
         w = 200 * DEG
-        rate, alpha = np.zeros((len(TIME), 3)), np.zeros((len(TIME), 3))
+        rate, alpha = np.zeros((len(MOTION_TIME), 3)), np.zeros((len(MOTION_TIME), 3))
         third = 3 - inner - outer
         rate[:, inner] = w
-        rate[:, outer], rate[:, third] = w * np.cos(w * TIME), -w * np.sin(w * TIME)
-        alpha[:, outer], alpha[:, third] = -w * w * np.sin(w * TIME), -w * w * np.cos(w * TIME)
-        up = np.zeros((len(TIME), 3))
-        up[:, outer], up[:, third] = np.cos(w * TIME), -np.sin(w * TIME)
-        pieces.append(Reference(TIME, _attitudes(up), gravity * up, rate, alpha, gravity))
+        rate[:, outer], rate[:, third] = w * np.cos(w * MOTION_TIME), -w * np.sin(w * MOTION_TIME)
+        alpha[:, outer], alpha[:, third] = -w * w * np.sin(w * MOTION_TIME), -w * w * np.cos(w * MOTION_TIME)
+        up = np.zeros((len(MOTION_TIME), 3))
+        up[:, outer], up[:, third] = np.cos(w * MOTION_TIME), -np.sin(w * MOTION_TIME)
+        pieces.append(Reference(MOTION_TIME, _attitudes(up), gravity * up, rate, alpha, gravity))
     return pieces
 
 
@@ -135,7 +134,7 @@ def _fine_poses():
 
 SPINS = (-200, -100, 100, 200)
 """Speeds of a spin, deg/s."""
-AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+AXIS_DIRECTIONS = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
 def _spins_about(axis, up=None):
@@ -149,13 +148,13 @@ def _oscillates_about(axis, up=None):
 
 
 MOTIONS = (
-    Motion('static_poses', 'rest in six faces and twelve edge positions, at several headings', _poses(EDGES)),
+    Motion('static_poses', 'rest in six faces and twelve edge positions, at several headings', _poses(POSE_DIRECTIONS)),
     Motion('static_dense', 'rest every 15 degrees on three rings', _poses(_fine_poses())),
-    *(_spins_about(axis) for axis in AXES),
+    *(_spins_about(axis) for axis in AXIS_DIRECTIONS),
     Motion('three_speeds', 'spin about skewed axes at 50, 100 and 200 deg/s in both senses', lambda g: [
         piece for axis in ((1, 1, 0), (0, 1, 1), (1, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1))
         for piece in _spin(axis, (-200, -100, -50, 50, 100, 200))(g)]),
-    *(_oscillates_about(axis) for axis in AXES),
+    *(_oscillates_about(axis) for axis in AXIS_DIRECTIONS),
     Motion('two_axis', 'turn about two axes at once at 200 deg/s, for each pair of axes', _two_axis),
     Motion('centrifuge', 'spin at 300 deg/s on an arm of 0.3 m, about each axis', lambda g: [
         piece for k in range(3) for piece in _spin(np.eye(3)[k], (-300, 300), arm=0.3 * np.roll(np.eye(3)[k], 1))(g)]),
@@ -180,7 +179,7 @@ def motions_about(axis_s: np.ndarray, up_s: np.ndarray) -> tuple[Motion, ...]:
         Unit vectors of the axis and of the vertical, sensor frame, at any angle of the joint.
 
     """
-    along = [axis for axis in AXES if abs(float(np.dot(axis, axis_s))) > ALONG]
+    along = [axis for axis in AXIS_DIRECTIONS if abs(float(np.dot(axis, axis_s))) > MIN_AXIS_COSINE]
     if not along:
         return ()
     share = float(np.clip(np.dot(axis_s, up_s) * np.sign(np.dot(along[0], axis_s)), -1.0, 1.0))

@@ -12,11 +12,11 @@ from typing import Any, Protocol
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD, NOISE
+from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE
 from imu_calibration.estimation.noise_search import GroupVariances, estimate_group_variances
 from imu_calibration.estimation.scaled_solve import covariance_with_held
 
-ITERATIONS = 15
+MAX_NEWTON_STEPS = 15
 """Largest number of Gauss-Newton steps; four to six are usual."""
 FLAT_PRIOR_FACTOR = 1e4
 """Factor on the prior sds for an estimate from the data: large enough to remove the priors, small enough for rounding."""
@@ -101,7 +101,7 @@ def estimate_rows(reference: RowReference, state: Any, *, fallback: np.ndarray) 
     factor = _factor(rows, scatter)
     own, of_held = covariance_with_held(factor, free, held, prior_sd=priors)
     scattered = _of_scatter(rows, scatter, free)
-    terms = {NOISE: own - scattered, BIAS_PROCESS: scattered, HELD: of_held}
+    terms = {SAMPLE_NOISE: own - scattered, BIAS_PROCESS: scattered, HELD_PRIORS: of_held}
     return RowEstimate(state, terms, held, free, scatter, factor, steps + more)
 
 
@@ -131,7 +131,7 @@ def _data_sd(scaled):
 def _iterate(reference, state, free, priors, *, variance, fallback):
     """Repeat steps and scatter estimates until both converge."""
     scatter = GroupVariances(np.array(variance, float), np.full(len(fallback), np.inf), np.array(variance, float))
-    for number in range(1, ITERATIONS + 1):
+    for number in range(1, MAX_NEWTON_STEPS + 1):
         rows = reference.linearise(state)
         n_nuisances, n_free = rows.nuisance.shape[1], int(free.sum())
         design = np.vstack([np.hstack([rows.nuisance, rows.main[:, free]]), np.eye(n_nuisances + n_free)[n_nuisances:]])

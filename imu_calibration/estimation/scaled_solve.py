@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 from scipy.linalg import lapack
 
-BLOCK = 2000
+FACTORED_ROWS = 2000
 """Rows per orthogonal factorisation: taller blocks do not fit in the processor's cache."""
 PANEL = 4
 """Columns that are reflected at a time."""
@@ -20,9 +20,9 @@ def triangular(rows: np.ndarray) -> np.ndarray:
     if count < 2 * width:
         return _r_factor(np.array(rows, order='F'))
     factor = np.zeros((width, width), order='F')
-    for start in range(0, count, BLOCK):
+    for start in range(0, count, FACTORED_ROWS):
         # Each block is folded into the triangle, whose zeros are skipped.
-        block = np.array(rows[start:start + BLOCK], order='F')
+        block = np.array(rows[start:start + FACTORED_ROWS], order='F')
         factor, _, _, info = lapack.dtpqrt(0, min(PANEL, width), factor, block, overwrite_a=1, overwrite_b=1)
         _require_finite(info, factor)
     return np.triu(factor)

@@ -12,7 +12,7 @@ from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, Refe
 from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters
 
-LEAST_INFLATION, LEAST_SHAKEN = 0.8, 0.01
+MIN_INFLATION, MIN_SHAKEN_INFLATION = 0.8, 0.01
 """Least noise at low frequency as a share of white noise of the same variance, at rest and under vibration."""
 LEAST_NOISE = {'accelerometer': 1e-6, 'gyroscope': 1e-7}
 """Least noise of a sample, m/s^2 and rad/s: readings of a noise-free simulator are exact except for stamps in integer ns."""
@@ -48,7 +48,7 @@ def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | 
         pooled[axis] = np.average(variances[:, axis], weights=weight) if weight.sum() else usual
         weight = (counts >= 32) * near
         factors[axis] = np.average(inflations[:, axis], weights=weight) if weight.sum() else 1.0
-        factors[axis] = max(factors[axis], LEAST_SHAKEN if shaken else LEAST_INFLATION)
+        factors[axis] = max(factors[axis], MIN_SHAKEN_INFLATION if shaken else MIN_INFLATION)
     return np.maximum(pooled, LEAST_NOISE[sensor]**2), factors
 
 
@@ -57,7 +57,7 @@ def _usual(variances, inflations):
     median = float(np.median(variances))
     quiet = float(np.partition(variances, 1)[1]) if len(variances) > 3 else median
     louder = variances > VIBRATES * quiet
-    shaken = 0.0 < VIBRATES * quiet < median and float(np.median(inflations[louder])) < LEAST_INFLATION
+    shaken = 0.0 < VIBRATES * quiet < median and float(np.median(inflations[louder])) < MIN_INFLATION
     return (quiet if shaken else median), shaken
 
 

@@ -10,7 +10,7 @@ from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, not_separable
-from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD, NOISE
+from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE
 from imu_calibration.estimation.model_error import model_error
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, inverse_normal, scaled_lstsq
@@ -19,13 +19,13 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.weighted_system import Prior, WeightedSystem, fixed_parameters, make_prior
 from imu_calibration.estimation.whitening import predict_session_offsets
 
-P_VALUE = 1e-3
+OUTLIER_P_VALUE = 1e-3
 """False positive rate per sensor and kind for a recording without outliers."""
-SHARE = 0.15
+MAX_WINDOW_OUTLIERS = 0.15
 """Largest share of each kind that is excluded; a more frequent deviation is a property of the recording."""
-LEAST_SPARE = 9.0
+MIN_WINDOW_FREEDOM = 9.0
 """Residual degrees of freedom of the other windows of the kind that the test requires."""
-CANDIDATES = 8
+OUTLIER_CANDIDATES = 8
 """Windows of each kind under test per round, in order of their residual."""
 LEAST_SEEN = 0.05
 """A window whose error keeps less than this share in the residuals is not tested."""
@@ -61,10 +61,10 @@ def contradicted(system: WeightedSystem, values: np.ndarray, noises: dict[str, N
 def _of_kind(own: np.ndarray, out: np.ndarray, fit: '_Fit') -> tuple[float, list[int]]:
     """Return (the smallest p-value, the numbers of the outliers among the windows `own`), without the windows `out`."""
     count, kept = int(own.sum()), np.flatnonzero(own & ~out)
-    allowed = max(1, int(SHARE * count)) - (count - len(kept))
-    worst = kept[np.argsort(-(fit.rest[kept]**2).sum(axis=1), kind='stable')][:CANDIDATES] if allowed > 0 else []
+    allowed = max(1, int(MAX_WINDOW_OUTLIERS * count)) - (count - len(kept))
+    worst = kept[np.argsort(-(fit.rest[kept]**2).sum(axis=1), kind='stable')][:OUTLIER_CANDIDATES] if allowed > 0 else []
     found = sorted((fit.p_value(at, kept) * len(kept), at) for at in worst)[:allowed]
-    return found[0][0] if found else 1.0, [at for chance, at in found if chance < P_VALUE]
+    return found[0][0] if found else 1.0, [at for chance, at in found if chance < OUTLIER_P_VALUE]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +101,13 @@ class _Fit:
         better = self.rest - (one - np.einsum('kap,pq,aq->ka', self.design, self.covariance, along)) * size
         leverage = np.einsum('kap,pq,kaq->ka', self.design[own], self.covariance, self.design[own]).sum()
         spare = 3 * len(own) - leverage - 3
-        if spare < LEAST_SPARE:
+        if spare < MIN_WINDOW_FREEDOM:
             return 1.0
         total, others = ((part[own]**2).sum() for part in (self.rest, better))
         return chance_of_fall(total - others, 3, rest=others, spare=spare)
 
 
-FAR = 3.0
+MAX_PRIOR_SDS = 3.0
 """Prior standard deviations beyond which an entry of a matrix needs a reason that is not misfit."""
 
 REST_NOISE_MARGIN = 1.1
@@ -148,7 +148,7 @@ def unbelievable(system: WeightedSystem, values: np.ndarray, *, sd: np.ndarray, 
 
 
 def _limit(effect: Effect) -> float:
-    return FAR * float(np.max(effect.prior_sds())) if effect.role is Role.LINEAR else effect.largest
+    return MAX_PRIOR_SDS * float(np.max(effect.prior_sds())) if effect.role is Role.LINEAR else effect.largest
 
 
 def _feigned(system, sensor, values, noise):
@@ -235,7 +235,7 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
         held |= strange
     error = model_error(system, values, noises, free=free & ~held)
     moving = system.bias_information(values, noises)
-    terms = {NOISE: own - own @ moving @ own, BIAS_PROCESS: own @ moving @ own, HELD: of_held} | error.terms(own + of_held)
+    terms = {SAMPLE_NOISE: own - own @ moving @ own, BIAS_PROCESS: own @ moving @ own, HELD_PRIORS: of_held} | error.terms(own + of_held)
     chi2, rms = _fit_quality(system, values, noises)
     return Solution(model, values, terms, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises), error,
                     not_believed)

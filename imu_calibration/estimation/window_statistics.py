@@ -18,11 +18,11 @@ from imu_calibration.preprocessing.window import Window
 
 PIECE_TIME = 0.25
 """Length of a piece, s: noise averages out, and a sweep of a table is still several pieces."""
-SLOW, FAST = 30.0 * DEG, 120.0 * DEG
+MAX_SLOW_RATE, MIN_FAST_RATE = 30.0 * DEG, 120.0 * DEG
 """Rates between the regimes, rad/s."""
 ACCELERATING = 90.0 * DEG
 """Change of the rate per second from which on a piece counts as accelerating, rad/s^2."""
-AXES = 3
+N_AXES = 3
 
 
 class Regime(StrEnum):
@@ -37,7 +37,7 @@ class Regime(StrEnum):
 
 def pieces_at_rest(mean: np.ndarray, duration: float) -> dict[str, np.ndarray]:
     """Return {regime: rows} of a static window: its mean row ``[columns | output]``, weighed as so many pieces, and no change of input."""
-    row = np.concatenate([mean[:-AXES], np.zeros(AXES), mean[-AXES:]])
+    row = np.concatenate([mean[:-N_AXES], np.zeros(N_AXES), mean[-N_AXES:]])
     return {Regime.REST: np.sqrt(count_pieces(duration)) * row[None]}
 
 
@@ -68,8 +68,8 @@ def moving_pieces(rows: np.ndarray, time: np.ndarray, true_input: np.ndarray, *,
     length = np.diff(edges)[:, None]
     means = np.add.reduceat(rows, edges[:-1], axis=0) / length
     rate, change = np.linalg.norm(np.add.reduceat(rate_s, edges[:-1], axis=0) / length, axis=1), _slope(rate_s, time, edges)
-    pieces = np.concatenate([means[:, :-AXES], _slope(true_input, time, edges), means[:, -AXES:]], axis=1)
-    regime = np.select([np.linalg.norm(change, axis=1) > ACCELERATING, rate > FAST, rate > SLOW], [3, 2, 1], 0)
+    pieces = np.concatenate([means[:, :-N_AXES], _slope(true_input, time, edges), means[:, -N_AXES:]], axis=1)
+    regime = np.select([np.linalg.norm(change, axis=1) > ACCELERATING, rate > MIN_FAST_RATE, rate > MAX_SLOW_RATE], [3, 2, 1], 0)
     names = (Regime.SLOW, Regime.MEDIUM, Regime.FAST, Regime.ACCELERATING)
     return {name: pieces[regime == k] for k, name in enumerate(names) if np.any(regime == k)}
 

@@ -128,7 +128,7 @@ def wobble_at(wobble: tuple[tuple[int, complex], ...], angle: np.ndarray, rate: 
     return found
 
 
-_BLOCK = 8192  # samples whose intermediates fit in the processor's cache
+_CHAIN_BLOCK_SAMPLES = 8192  # samples whose intermediates fit in the processor's cache
 
 
 class _Link(NamedTuple):
@@ -201,8 +201,8 @@ def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarra
     rate_s, alpha_s = np.empty((n_samples, 3)), np.empty((n_samples, 3))
     constants = _constants(table)
     steps = _chain_steps(constants, motion)
-    for start in range(0, n_samples, _BLOCK):
-        part = slice(start, min(start + _BLOCK, n_samples))
+    for start in range(0, n_samples, _CHAIN_BLOCK_SAMPLES):
+        part = slice(start, min(start + _CHAIN_BLOCK_SAMPLES, n_samples))
         columns = _run_chain(constants.base, motion, steps, part)
         mat_sn[part] = columns[:, :3].transpose(2, 0, 1)
         rate_s[part], alpha_s[part], force_s[part] = columns[:, 3].T, columns[:, 4].T, columns[:, 5].T

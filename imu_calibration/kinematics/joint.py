@@ -9,7 +9,7 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.rotations import rotation_from_rpy
 
-LARGEST = 1e6
+MAX_TABLE_NUMBER = 1e6
 """Largest number of a table (axis, place, angle, speed); products of larger numbers would overflow."""
 
 
@@ -49,7 +49,7 @@ def several_numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
 
 def finite_number(value: Any, what: str, low: float | None, *, high: float | None, advice: str) -> float:
     """Return one finite number within [low, high], by default the limits of any number of a table."""
-    low, high = -LARGEST if low is None else low, LARGEST if high is None else high
+    low, high = -MAX_TABLE_NUMBER if low is None else low, MAX_TABLE_NUMBER if high is None else high
     # YAML 1.1 reads 1e-5, without a point, as text.
     try:
         number = float('nan') if isinstance(value, bool) else float(value)

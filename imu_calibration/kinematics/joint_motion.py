@@ -98,7 +98,7 @@ def encoder_step(position: np.ndarray) -> float:
 LINKED = 0.1
 """Largest distance of stamps for interpolation, s; stamps further apart belong to different windows or rests."""
 
-BLOCK = 4096
+DERIVATIVE_BLOCK_ROWS = 4096
 """Rows per block, so that they fit in the processor's cache."""
 
 
@@ -128,8 +128,8 @@ def shifted(motion: JointMotion, delay: float | np.ndarray) -> JointMotion:
         moved = _taylor(derivatives, -delay)
     else:
         target, moved = motion.time - delay, np.empty_like(derivatives)
-        for first in range(0, len(target), BLOCK):
-            rows = slice(first, first + BLOCK)
+        for first in range(0, len(target), DERIVATIVE_BLOCK_ROWS):
+            rows = slice(first, first + DERIVATIVE_BLOCK_ROWS)
             moved[:, :, rows] = _interpolated(motion.time, step, derivatives, target[rows], delay[rows] > 0)
     return replace(motion, position=moved[0].T, rate=moved[1].T, acceleration=moved[2].T, jerk=moved[3].T)
 

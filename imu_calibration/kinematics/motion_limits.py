@@ -105,11 +105,11 @@ USUAL = {True: (150.0 * DEG, 300.0 * DEG), False: (0.25, 0.5)}
 """Default speed and acceleration of rotating and of sliding joints: rad/s, rad/s^2; m/s, m/s^2."""
 NOT_CHECKED = 'only the limits of the joints are checked, not collisions of the robot with itself, its surroundings or its cables'
 """Stated wherever a plan is printed, saved or driven."""
-DEFAULT, ROBOT, TABLE = 'default', 'robot description', 'table file'
+DEFAULT_ORIGIN, ROBOT_ORIGIN, TABLE_ORIGIN = 'default', 'robot description', 'table file'
 """Origins of limits; default: no description gives it."""
 RADIANS = 2 * np.pi
 """A range in degrees with smaller ends is probably in radians."""
-WIDEST = 20 * np.pi
+MAX_RADIAN_RANGE = 20 * np.pi
 """A range of ten turns in a robot description is probably in degrees, rad."""
 
 
@@ -188,7 +188,7 @@ def limits_of(table: Table) -> MotionLimits:
     names = table.joint_names
     turns = np.ones(len(names), bool)
     lower, upper, fastest = np.full(len(names), -np.inf), np.full(len(names), np.inf), np.full((2, len(names)), np.inf)
-    origins = [[DEFAULT] * 3 for _ in names]
+    origins = [[DEFAULT_ORIGIN] * 3 for _ in names]
     # A joint's own entry is last, so that a follower does not determine its type.
     for joint in sorted(table.joints, key=lambda joint: joint.mimic is None):
         column, limits = names.index(joint.source), joint.limits
@@ -213,16 +213,16 @@ def limits_of(table: Table) -> MotionLimits:
 
 
 def _origin(joint: Joint, name: str) -> str:
-    where = ROBOT if name in joint.limits.described else TABLE
+    where = ROBOT_ORIGIN if name in joint.limits.described else TABLE_ORIGIN
     return where if joint.mimic is None else f'{where}, joint {joint.name}'
 
 
 def missing_ranges(table: Table) -> tuple[str, ...]:
     """Return the joints whose range is unknown or implausibly wide: neither a plausible range nor declared endless."""
     limits = limits_of(table)
-    wide = limits.turns & np.isfinite(limits.lower) & (limits.upper - limits.lower > WIDEST)
+    wide = limits.turns & np.isfinite(limits.lower) & (limits.upper - limits.lower > MAX_RADIAN_RANGE)
     return tuple(name for name, origin, is_wide in zip(table.joint_names, limits.origins, wide, strict=True)
-                 if origin[0] == DEFAULT or (is_wide and origin[0].startswith(ROBOT)))
+                 if origin[0] == DEFAULT_ORIGIN or (is_wide and origin[0].startswith(ROBOT_ORIGIN)))
 
 
 def range_warnings(table: Table) -> list[str]:
@@ -248,7 +248,7 @@ def limit_words(table: Table, limits: MotionLimits) -> list[str]:
         factor, unit = (180 / np.pi, 'deg') if limits.turns[k] else (1.0, 'm')
         declared = 'endless' if described.endless[k] else ''
         ends = f'{factor * limits.lower[k]:.4g} to {factor * limits.upper[k]:.4g} {unit}' if np.isfinite(limits.lower[k]) else ''
-        text = 'no range' if of_range == DEFAULT else f'{", here ".join(filter(None, (declared, ends)))} ({of_range})'
+        text = 'no range' if of_range == DEFAULT_ORIGIN else f'{", here ".join(filter(None, (declared, ends)))} ({of_range})'
         lines.append(f'{name}: {text}, {factor * limits.speed[k]:.4g} {unit}/s ({of_speed}), '
                      f'{factor * limits.acceleration[k]:.4g} {unit}/s^2 ({of_acceleration})')
     return lines

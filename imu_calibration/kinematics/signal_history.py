@@ -10,7 +10,7 @@ CORNER = 5.0
 Frequency of a triple high pass, whose output is vibration, Hz: gravity rotating at 200 deg/s contributes 0.02 m/s^2,
 slow oscillation of joints zero.
 """
-MEMORY = 0.5
+MEAN_SQUARE_SECONDS = 0.5
 """Time constant of the running mean of its square, s: as long as a table settles."""
 _STAGES = 3
 
@@ -80,7 +80,7 @@ def autoregressive(drive: np.ndarray, decay: float, before: ArrayLike) -> np.nda
 
 
 def _decays(period):
-    return math.exp(-2.0 * math.pi * CORNER * period), math.exp(-period / MEMORY)
+    return math.exp(-2.0 * math.pi * CORNER * period), math.exp(-period / MEAN_SQUARE_SECONDS)
 
 
 HALF_WIDTH = 1.0

@@ -13,18 +13,18 @@ from scipy.sparse import csr_matrix
 from imu_calibration.core.samples import runs_of
 
 DEGREE = 5
-ORDER = DEGREE + 1
-_BLOCK = 8192  # instants whose intermediates fit in the processor's cache
+SPLINE_ORDER = DEGREE + 1
+_SPLINE_BLOCK_SAMPLES = 8192  # instants whose intermediates fit in the processor's cache
 
 
 def _piece_matrix():
     """Return M with ``basis a on its interval = sum_k M[k, a] u^k``; basis a belongs to coefficient ``interval + a``."""
-    matrix = np.zeros((ORDER, ORDER))
-    for basis in range(ORDER):
+    matrix = np.zeros((SPLINE_ORDER, SPLINE_ORDER))
+    for basis in range(SPLINE_ORDER):
         piece = DEGREE - basis
         for shift in range(piece + 1):
-            scale = (-1) ** shift * comb(ORDER, shift) / 120
-            for power in range(ORDER):
+            scale = (-1) ** shift * comb(SPLINE_ORDER, shift) / 120
+            for power in range(SPLINE_ORDER):
                 matrix[power, basis] += scale * comb(DEGREE, power) * float(piece - shift) ** (DEGREE - power)
     return matrix
 
@@ -62,7 +62,7 @@ def design_values(knots: Knots, time: np.ndarray, derivative: int = 0) -> tuple[
     matrix = PIECES
     for _ in range(derivative):
         matrix = np.arange(1, len(matrix))[:, None] * matrix[1:] / knots.step
-    values = np.broadcast_to(matrix[-1][:, None], (ORDER, len(time)))
+    values = np.broadcast_to(matrix[-1][:, None], (SPLINE_ORDER, len(time)))
     for row in matrix[-2::-1]:
         values = values * place + row[:, None]
     return interval, values
@@ -70,24 +70,24 @@ def design_values(knots: Knots, time: np.ndarray, derivative: int = 0) -> tuple[
 
 def design_matrix(knots: Knots, interval: np.ndarray, values: np.ndarray) -> Any:
     """Return the sparse design, shape (n, n_coefficients)."""
-    columns = interval[:, None] + np.arange(ORDER)
-    return csr_matrix((np.ascontiguousarray(values.T).ravel(), columns.ravel(), np.arange(0, columns.size + 1, ORDER)),
+    columns = interval[:, None] + np.arange(SPLINE_ORDER)
+    return csr_matrix((np.ascontiguousarray(values.T).ravel(), columns.ravel(), np.arange(0, columns.size + 1, SPLINE_ORDER)),
                       shape=(len(interval), knots.n_coefficients))
 
 
 def normal_bands(knots: Knots, interval: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the lower bands of design.T @ design, shape (6, n_coefficients), in the format of `scipy.linalg.solveh_banded`."""
     size = knots.n_coefficients
-    bands = np.zeros((ORDER, size))
-    for first in range(ORDER):
-        for second in range(first, ORDER):
+    bands = np.zeros((SPLINE_ORDER, size))
+    for first in range(SPLINE_ORDER):
+        for second in range(first, SPLINE_ORDER):
             bands[second - first] += np.bincount(interval + first, values[first] * values[second], size)
     return bands
 
 
 def penalty_bands(weights: np.ndarray) -> np.ndarray:
     """Return the lower bands of D.T @ diag(weights) @ D with D the third differences of the coefficients, shape (6, n_weights + 3)."""
-    bands = np.zeros((ORDER, len(weights) + 3))
+    bands = np.zeros((SPLINE_ORDER, len(weights) + 3))
     for first in range(4):
         for second in range(first, 4):
             bands[second - first, first:first + len(weights)] += _THIRD_DIFFERENCE[first] * _THIRD_DIFFERENCE[second] * weights
@@ -96,7 +96,7 @@ def penalty_bands(weights: np.ndarray) -> np.ndarray:
 
 def piece_coefficients(coefficients: np.ndarray) -> np.ndarray:
     """Return the polynomial of each interval in its place u, shape (6 powers, n_intervals, n_joints)."""
-    windows = np.lib.stride_tricks.sliding_window_view(coefficients, ORDER, axis=0)
+    windows = np.lib.stride_tricks.sliding_window_view(coefficients, SPLINE_ORDER, axis=0)
     return np.ascontiguousarray(np.moveaxis(windows @ PIECES.T, -1, 0))
 
 
@@ -104,8 +104,8 @@ def evaluate_pieces(knots: Knots, pieces: np.ndarray, time: np.ndarray, *, deriv
     """Return the values and the first `derivatives` derivatives at `time`, shape (derivatives + 1, n, n_joints)."""
     n_joints = pieces.shape[2]
     result = np.zeros((derivatives + 1, len(time), n_joints))
-    for start in range(0, len(time), _BLOCK):
-        part = slice(start, start + _BLOCK)
+    for start in range(0, len(time), _SPLINE_BLOCK_SAMPLES):
+        part = slice(start, start + _SPLINE_BLOCK_SAMPLES)
         interval, place = knots.locate(time[part])
         _horner(pieces, interval, np.repeat(place, n_joints).reshape(-1, n_joints), result[:, part])
     for order in range(1, derivatives + 1):
@@ -171,7 +171,7 @@ class PenalisedSpline:
         interior = np.tile(_taper(self.n_rows // n_kinds) ** 2, n_kinds)
         self._interior = interior / interior.sum()
         self.density = self.n_rows / self.n_coefficients
-        self._mean_bands = bands.sum(axis=1) / self.n_coefficients * np.where(np.arange(ORDER) == 0, 1.0, 2.0)
+        self._mean_bands = bands.sum(axis=1) / self.n_coefficients * np.where(np.arange(SPLINE_ORDER) == 0, 1.0, 2.0)
         self.least_decade = self._least_decade()
         self._gains = {}
         self._theta = (np.arange(512) + 0.5) * np.pi / 512
@@ -179,7 +179,7 @@ class PenalisedSpline:
 
     def symbols(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return N and p, the normal matrix and the penalty at the frequencies `theta`, rad per knot."""
-        normal = np.cos(theta[:, None] * np.arange(ORDER)) @ self._mean_bands
+        normal = np.cos(theta[:, None] * np.arange(SPLINE_ORDER)) @ self._mean_bands
         return np.maximum(normal, 1e-6 * self.density), (2 - 2 * np.cos(theta)) ** 3
 
     def fit(self, values: np.ndarray, penalty: float, with_ends: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -193,7 +193,7 @@ class PenalisedSpline:
     def _least_decade(self):
         """Return the smallest penalty (decade) for which the factor exists: holes of m knots give it eigenvalues of about (pi / m)^6."""
         empty = self.bands[0] < 1e-9 * self.density
-        hole = np.max(np.diff(runs_of(empty)), initial=0) + ORDER
+        hole = np.max(np.diff(runs_of(empty)), initial=0) + SPLINE_ORDER
         return max(_COARSE[0], 6 * np.log10(hole / np.pi) - 13)
 
     def _end_weights(self, penalty):

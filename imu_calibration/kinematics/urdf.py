@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.core.documents import LARGEST
+from imu_calibration.core.documents import MAX_DOCUMENT_CHARACTERS
 from imu_calibration.core.errors import InputError, printable, shortened
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.kinematics.joint import LIMIT_KEYS, Joint, JointLimits, Mimic, limits_from_mapping, require_keys, three_numbers
@@ -199,8 +199,8 @@ def _read(text):
         raise InputError("a robot description needs the package urdfdom-py, it is not installed; install 'imu_calibration[arm]'",
                          code='package_missing') from error
     try:
-        if len(text) > LARGEST:
-            raise ValueError(f'it has {len(text)} characters, at most {LARGEST} are accepted')
+        if len(text) > MAX_DOCUMENT_CHARACTERS:
+            raise ValueError(f'it has {len(text)} characters, at most {MAX_DOCUMENT_CHARACTERS} are accepted')
         root = ElementTree.fromstring(text)
         for element in root.iter():
             element.attrib.update((key, printable(value)) for key, value in element.items())

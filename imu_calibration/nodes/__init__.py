@@ -10,7 +10,7 @@ import signal
 import sys
 from importlib.util import find_spec
 
-NAMES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
+NODE_NAMES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
 """Executables of this package; the nodes of other packages that import it keep their own interrupt."""
 
 
@@ -33,7 +33,7 @@ def is_node_process() -> bool:
     """Return whether this process was started to run one of the nodes, by its executable or by ``python -m``."""
     if sys.argv[:1] == ['-m']:
         return any(argument.startswith('imu_calibration.nodes.') for argument in sys.orig_argv)
-    return bool(sys.argv) and os.path.basename(sys.argv[0]) in NAMES
+    return bool(sys.argv) and os.path.basename(sys.argv[0]) in NODE_NAMES
 
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')   # as the command line does, before numpy is imported

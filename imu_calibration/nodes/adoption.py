@@ -16,8 +16,8 @@ from imu_calibration.document.trust import with_measured_noise
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.robot_stand import TF_STATIC, StaticFrames
 
-FILE, TOPIC, FILE_THEN_TOPIC = 'file', 'topic', 'file_then_topic'
-ADOPT = (FILE, TOPIC, FILE_THEN_TOPIC)
+FROM_FILE, FROM_TOPIC, FILE_THEN_TOPIC = 'file', 'topic', 'file_then_topic'
+ADOPT = (FROM_FILE, FROM_TOPIC, FILE_THEN_TOPIC)
 """
 Source of the calibrations.
 
@@ -87,7 +87,7 @@ class CompensatorSettings:
     @property
     def takes_topic(self) -> bool:
         """Whether calibrations received on the topic are adopted."""
-        return self.adopt == TOPIC or (self.adopt == FILE_THEN_TOPIC and not self.calibration_file)
+        return self.adopt == FROM_TOPIC or (self.adopt == FILE_THEN_TOPIC and not self.calibration_file)
 
 
 class Awaited(ImuCalibrationError):

@@ -14,7 +14,7 @@ from imu_calibration.document import files
 from imu_calibration.nodes.inputs import latched_qos, output_qos
 from imu_calibration.nodes.lifecycle import announce, run_node
 from imu_calibration.nodes.parameters import declare_parameters
-from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
+from imu_calibration.nodes.playback import PLAYBACK_DEPTH, Batch, Pace, Playback
 from msg_adapters.rosbag2 import Rosbag2
 
 PAUSE = 0.01
@@ -95,7 +95,7 @@ class BagPlayerNode(Node):
     def _publisher(self, name):
         latched = any(profile.get('durability') == 'transient_local' for profile in self._bag.qos(name))
         # Relative, so that namespaces and remappings move it.
-        qos = latched_qos() if latched else output_qos(DEPTH)
+        qos = latched_qos() if latched else output_qos(PLAYBACK_DEPTH)
         return self.create_publisher(_message_class(self._bag.types[name]), name.lstrip('/'), qos)
 
     def _batches(self, first_ns):

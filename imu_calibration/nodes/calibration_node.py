@@ -25,7 +25,7 @@ from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.nodes.calibration_status import CalibrationGuide, markers_of, statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker
-from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
+from imu_calibration.nodes.complaints import LOG_ERROR, LOG_INFO, Complaints, say
 from imu_calibration.nodes.diagnosis_thread import Listeners, give_arrays_own_pages
 from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
 from imu_calibration.nodes.inputs import BatchInput, latched_qos, output_qos, watch_inputs
@@ -45,7 +45,7 @@ MOST_WAITING = 200_000
 """Messages of a kind that wait for the worker at most, 100 s at 2 kHz; then the oldest are dropped and counted."""
 DOCUMENTED = ('accelerometer_model', 'gyroscope_model', 'reference_model', 'model_as_asked', 'serial', 'operator')
 """Parameters that the document names with their values."""
-PATIENCE = 3.0
+MAX_SILENCE_SECONDS = 3.0
 """Seconds after the start from which a silent topic is reported."""
 
 
@@ -161,7 +161,8 @@ class CalibrationNode(Node):
             live = self._make_live(place.earlier())
         except ImuCalibrationError as error:
             kept = place.put_aside()   # a save would write over it
-            say(self.get_logger(), ERROR, f'the saved session cannot be continued: {error}; a new one starts, earlier motion is in {kept}')
+            say(self.get_logger(), LOG_ERROR, f'the saved session cannot be continued: {error}; a new one starts, '
+                f'earlier motion is in {kept}')
             return self._make_live()
         self.get_logger().info(f'continued with {live.n_windows} {live.observations} from {place.accumulator}'
                                if live.n_windows else f'no session in {place.accumulator}: a new session starts')
@@ -175,7 +176,7 @@ class CalibrationNode(Node):
             if not self.worker.is_alive():
                 break
         response.success, response.message = request.success, request.message
-        say(self.get_logger(), INFO if request.success else ERROR, f'~/{what}: {request.message}')
+        say(self.get_logger(), LOG_INFO if request.success else LOG_ERROR, f'~/{what}: {request.message}')
         self._diagnostics.publish_now()
         return response
 
@@ -223,7 +224,7 @@ class CalibrationNode(Node):
             about_topics.append("joint states are published and not listened to: "
                                 "to calibrate on a table or an arm give 'table_file' or 'urdf_file'")
         trouble = [state.streams.message] if state.streams is not None and state.streams.word == 'trouble' and not silent else []
-        if time.monotonic() - self._started > PATIENCE:
+        if time.monotonic() - self._started > MAX_SILENCE_SECONDS:
             self._complaints.now('calibration', about_topics + silent + trouble, state.faults)
         for level, line in self._guide.lines(state):
             say(self.get_logger(), level, line)

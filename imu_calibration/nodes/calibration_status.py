@@ -14,12 +14,12 @@ from visualization_msgs.msg import Marker, MarkerArray
 from imu_calibration.calibration.coverage import (
     ARMS_TIMES,
     ARROW,
-    DONE,
+    DONE_COLOUR,
     NOW,
     RADIUS,
-    TINY,
+    SEEN_DIAMETER,
+    TEXT_COLOUR,
     VISITED,
-    WHITE,
     Coverage,
     GroupState,
     cells_of,
@@ -29,7 +29,7 @@ from imu_calibration.calibration.diagnosis import live_diagnosis as diagnosis
 from imu_calibration.calibration.diagnosis.live_diagnosis import DiagnosisState
 from imu_calibration.calibration.session import SessionStatus
 from imu_calibration.document.decision import HARMS
-from imu_calibration.nodes.complaints import INFO, WARNING
+from imu_calibration.nodes.complaints import LOG_INFO, LOG_WARN
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, make_status
 from imu_calibration.nodes.inputs import MatchedInput
 from imu_calibration.preprocessing.stamping import COUNTED, REGULAR
@@ -70,9 +70,9 @@ class WorkerState:
     """Whether each sensor helps and every requested parameter is determined."""
 
 
-PATIENCE = 5.0
+MIN_ADVICE_SECONDS = 5.0
 """Seconds between two pieces of advice; the most useful motion may change with every solution."""
-KINDS = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
+MESSAGE_TYPES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
 
 
 class CalibrationGuide:
@@ -102,7 +102,7 @@ class CalibrationGuide:
         """Yield (INFO or WARNING, line) for each change since the last call."""
         yield from self._streams(state)
         if state.gathered and not self._gathered:
-            yield INFO, f'first {self._noun} gathered'
+            yield LOG_INFO, f'first {self._noun} gathered'
         self._gathered = state.gathered
         yield from self._verdicts(state)
         yield from self._next(state)
@@ -111,12 +111,12 @@ class CalibrationGuide:
     def _streams(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         coming = set() if state.streams is None else {name for name in state.streams.coming if name in self._inputs}
         for name in sorted(coming - self._coming):
-            yield INFO, f'{KINDS[name]} messages are received on {self._inputs[name].source()}'
+            yield LOG_INFO, f'{MESSAGE_TYPES[name]} messages are received on {self._inputs[name].source()}'
         self._coming = coming
         line = None if state.streams is None else state.streams.stamping
         if line is not None and line.word != self._stamping:
             if line.word == COUNTED or (line.word == REGULAR and self._stamping):
-                yield INFO, f'Imu: {line}'
+                yield LOG_INFO, f'Imu: {line}'
             self._stamping = line.word
 
     def _verdicts(self, state: WorkerState) -> Iterator[tuple[str, str]]:
@@ -125,15 +125,15 @@ class CalibrationGuide:
             return
         self._verdict = known
         if state.complete:
-            yield INFO, f'{known}; save it with `{self._save_command}`'
+            yield LOG_INFO, f'{known}; save it with `{self._save_command}`'
         elif known:
-            yield WARNING if state.verdict == HARMS else INFO, '; '.join([known, *state.lines[:2]])
+            yield LOG_WARN if state.verdict == HARMS else LOG_INFO, '; '.join([known, *state.lines[:2]])
 
     def _next(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         advice = advice_of(state)
-        if advice and advice != self._advice and not state.complete and self._clock() - self._advised >= PATIENCE:
+        if advice and advice != self._advice and not state.complete and self._clock() - self._advised >= MIN_ADVICE_SECONDS:
             self._advice, self._advised = advice, self._clock()
-            yield INFO, f'next: {advice}'
+            yield LOG_INFO, f'next: {advice}'
 
     def _diagnosis(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         found = state.diagnosis
@@ -142,7 +142,7 @@ class CalibrationGuide:
         what = f'{found.word}:{found.values.get("effect", "")}'
         if what != self._diagnosed:
             self._diagnosed = what
-            yield WARNING if found.word == diagnosis.FAILED else INFO, f'diagnosis: {found.message}'
+            yield LOG_WARN if found.word == diagnosis.FAILED else LOG_INFO, f'diagnosis: {found.message}'
 
 
 def advice_of(state: WorkerState) -> str:
@@ -215,7 +215,7 @@ def driven_markers(up: np.ndarray, text: str, *, frame_id: str, stamp: Time) -> 
     return MarkerArray(markers=made)
 
 
-def _marker(name, number, kind, *, color=WHITE, alpha=1.0, scale=(1.0, 1.0, 1.0)):
+def _marker(name, number, kind, *, color=TEXT_COLOUR, alpha=1.0, scale=(1.0, 1.0, 1.0)):
     marker = Marker(ns=name, id=number, action=Marker.ADD, color=ColorRGBA(r=color[0], g=color[1], b=color[2], a=alpha))
     marker.type = kind
     marker.scale.x, marker.scale.y, marker.scale.z = map(float, scale)
@@ -239,7 +239,7 @@ def _cells(coverage):
 
 def _seen(coverage):
     if len(coverage.seen):
-        marker = _marker('seen', 0, Marker.SPHERE_LIST, color=VISITED, scale=(TINY,) * 3)
+        marker = _marker('seen', 0, Marker.SPHERE_LIST, color=VISITED, scale=(SEEN_DIAMETER,) * 3)
         marker.points = [_point(1.1 * RADIUS * up) for up in coverage.seen]
         yield marker
     if coverage.up is not None:
@@ -272,6 +272,6 @@ def _arrow(name, start, end, color, number=0):
 
 
 def _text(coverage):
-    marker = _marker('text', 0, Marker.TEXT_VIEW_FACING, color=DONE if coverage.done else WHITE, scale=(0.0, 0.0, 0.09))
+    marker = _marker('text', 0, Marker.TEXT_VIEW_FACING, color=DONE_COLOUR if coverage.done else TEXT_COLOUR, scale=(0.0, 0.0, 0.09))
     marker.text = line_of(coverage)
     return _at(marker, (0.0, 0.0, 1.6 * RADIUS))

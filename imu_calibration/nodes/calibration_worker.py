@@ -24,7 +24,7 @@ from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.preprocessing.window import WindowSettings
 from msg_adapters.live import LiveGatherer
 
-PERIOD = 0.1
+MESSAGE_CHECK_SECONDS = 0.1
 """Interval at which received messages are processed, s."""
 IDLE = 3.0
 """Seconds without messages after which open windows are included in a solution."""
@@ -106,7 +106,7 @@ class CalibrationWorker(threading.Thread):
         """Run the steps until `end`."""
         try:
             while not self._ending:
-                self._wake.wait(PERIOD)
+                self._wake.wait(MESSAGE_CHECK_SECONDS)
                 self._wake.clear()
                 for step in (self._take, self._answer, self._solve_when_due, self._adopt_what_was_found, self._autosave,
                              self._diagnose_when_due, self._tell,

@@ -24,7 +24,7 @@ from imu_calibration.document import files
 from imu_calibration.nodes import relay_loop
 from imu_calibration.nodes.adoption import Adopted, Awaited, CompensatorSettings, adopt, again, has_moved
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
-from imu_calibration.nodes.complaints import ERROR, Complaints
+from imu_calibration.nodes.complaints import LOG_ERROR, Complaints
 from imu_calibration.nodes.inputs import MatchedInput, latched_qos, output_qos, sent_ns, watch_inputs
 from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node
 from imu_calibration.nodes.message_compensation import LiveCompensation
@@ -142,7 +142,7 @@ class CompensatorNode(Node):
     def _failed(self, error: Exception) -> None:
         if self.context.ok():   # false while the node ends and publishing is impossible
             self.complaints.event('a message could not be used, the node continues unchanged: '
-                                  + shortened(f'{type(error).__name__}: {error}', 200), ERROR)
+                                  + shortened(f'{type(error).__name__}: {error}', 200), LOG_ERROR)
 
     def _on_document(self, message: String) -> None:
         self.documents.look()
@@ -174,7 +174,7 @@ class CompensatorNode(Node):
         if harmful is None or previous is None or watch is None or watch.health.state.word != HARMS:
             return
         self.complaints.event(f'calibration {harmful.version} harms, the previous calibration {previous.version} is used again: '
-                              f'{watch.health.state.message}', ERROR)
+                              f'{watch.health.state.message}', LOG_ERROR)
         self._harmful, self._previous, self.adopted = harmful.version, None, None
         self._put_in_force(again(previous, self.settings, self._frames))
 

@@ -11,10 +11,10 @@ from typing import Any
 
 from imu_calibration.core.errors import printable
 
-INFO, WARNING, ERROR = 'info', 'warning', 'error'
+LOG_INFO, LOG_WARN, LOG_ERROR = 'info', 'warning', 'error'
 REMINDER = 60.0
 """Interval at which a lasting fault is logged again, s."""
-PATIENCE = 10.0
+REPEAT_SECONDS = 10.0
 """Least interval between two lines about an intermittent fault, s."""
 MOST_KINDS = 1000
 """Largest number of kinds whose last time is stored: it bounds the memory."""
@@ -23,9 +23,9 @@ MOST_KINDS = 1000
 def say(logger: Any, level: str, line: str) -> None:
     """Log a line without control characters; one call per severity, because rclpy allows one severity per line of code."""
     line = printable(line)
-    if level == ERROR:
+    if level == LOG_ERROR:
         logger.error(line)
-    elif level == WARNING:
+    elif level == LOG_WARN:
         logger.warning(line)
     else:
         logger.info(line)
@@ -51,19 +51,19 @@ class Complaints:
         self._said: dict[str, float] = {}
         self._open: dict[str, str] = {}
 
-    def now(self, source: str, warnings: Iterable[str] = (), errors: Iterable[str] = (), *, patience: float = PATIENCE) -> None:
+    def now(self, source: str, warnings: Iterable[str] = (), errors: Iterable[str] = (), *, patience: float = REPEAT_SECONDS) -> None:
         """Log the present faults of `source` and the end of earlier ones; an ended one is repeated after `patience` seconds at least."""
-        present = {kind_of(source, line): (level, line) for level, lines in ((WARNING, warnings), (ERROR, errors)) for line in lines}
+        present = {kind_of(source, line): (level, line) for level, lines in ((LOG_WARN, warnings), (LOG_ERROR, errors)) for line in lines}
         for kind in [kind for kind in self._open if kind.startswith(source + ':') and kind not in present]:
-            say(self._logger, INFO, f'over: {self._open.pop(kind)}')
+            say(self._logger, LOG_INFO, f'over: {self._open.pop(kind)}')
         for kind, (level, line) in present.items():
             if self._due(kind, REMINDER if kind in self._open else patience):
                 say(self._logger, level, line)
                 self._open[kind] = line
 
-    def event(self, line: str, level: str = WARNING) -> None:
+    def event(self, line: str, level: str = LOG_WARN) -> None:
         """Log an event, which has no end."""
-        if self._due(kind_of('', line), PATIENCE):
+        if self._due(kind_of('', line), REPEAT_SECONDS):
             say(self._logger, level, line)
 
     def _due(self, kind: str, pause: float) -> bool:

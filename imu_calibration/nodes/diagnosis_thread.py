@@ -62,7 +62,7 @@ class Request:
         self.done.set()
 
 
-SHARE = 0.2
+MAX_DIAGNOSIS_SHARE = 0.2
 """Largest share of the time for diagnoses."""
 
 
@@ -81,7 +81,7 @@ class DiagnosisThread:
     """
 
     def __init__(self, period: float):
-        self.period, self._pacer, self._ending = period, SolvePacer(SHARE), False
+        self.period, self._pacer, self._ending = period, SolvePacer(MAX_DIAGNOSIS_SHARE), False
         self._thread: threading.Thread | None = None
         self._next, self._wanted, self._urgent = time.monotonic() + period, False, False
         self.state = DiagnosisState() if period else DiagnosisState(OFF, OFF_WHY)
@@ -101,7 +101,7 @@ class DiagnosisThread:
         return self._thread is not None and self._thread.is_alive()
 
     def want(self, urgent: bool = False) -> None:
-        """Request a diagnosis before the period is over, as soon as `SHARE` allows; at once when it is urgent."""
+        """Request a diagnosis before the period is over, as soon as `MAX_DIAGNOSIS_SHARE` allows; at once when it is urgent."""
         self._wanted, self._urgent = bool(self.period), urgent and bool(self.period)
 
     def forget(self) -> None:

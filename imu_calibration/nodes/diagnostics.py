@@ -15,7 +15,7 @@ from imu_calibration.core.errors import shortened
 from imu_calibration.nodes.lifecycle import every
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-PERIOD = 1.0
+DIAGNOSTICS_SECONDS = 1.0
 """Seconds between two messages; diagnostic aggregators call a status stale after five."""
 
 
@@ -43,7 +43,7 @@ def make_status(level: Any, name: str, message: str, *, values: Mapping[str, Any
 
 class DiagnosticsPublisher:
     """
-    Publishes the list of DiagnosticStatus that `collect` returns every `PERIOD`, and on `publish_now`.
+    Publishes the list of DiagnosticStatus that `collect` returns every `DIAGNOSTICS_SECONDS`, and on `publish_now`.
 
     The timer runs on the steady clock, so that diagnostics continue while simulated time is paused.
     """
@@ -51,7 +51,7 @@ class DiagnosticsPublisher:
     def __init__(self, node: Node, collect: Callable[[], list]):
         self._node, self._collect = node, collect
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._timer = every(node, PERIOD, self.publish_now)
+        self._timer = every(node, DIAGNOSTICS_SECONDS, self.publish_now)
 
     def publish_now(self) -> None:
         """Publish the present state, or the error that prevents its collection."""

@@ -23,14 +23,14 @@ from msg_adapters.imu_stream import ImuHeads
 from msg_adapters.live import LiveGatherer
 
 TYPE = 'sensor_msgs/msg/Imu'
-SECONDS = 3.0
-"""Seconds of recording, up to `PATIENCE` times as many if fewer than `ENOUGH` messages were received."""
+LISTEN_SECONDS = 3.0
+"""Seconds of recording, up to `RETRIES` times as many if fewer than `ENOUGH_MESSAGES` messages were received."""
 DISCOVERY = 2.0
-"""Seconds in which the nodes of the system are found, up to `PATIENCE` times where no Imu topic was."""
-PATIENCE = 3
-ENOUGH = 100
+"""Seconds in which the nodes of the system are found, up to `RETRIES` times where no Imu topic was."""
+RETRIES = 3
+ENOUGH_MESSAGES = 100
 """Messages that suffice to check a topic."""
-NAMES = ('imu/data', 'imu/data_raw', 'imu/data_corrected')
+IMU_TOPIC_ENDINGS = ('imu/data', 'imu/data_raw', 'imu/data_corrected')
 """Endings of topics that carry Imu messages by convention (REP 145)."""
 NOT_MEASURED = ('/imu/residual',)
 """Endings of topics of that type which are no measurement."""
@@ -60,7 +60,7 @@ def look(node: Node, spin_once: Any) -> list[StreamFindings]:
         Spins the node once; called with the node and ``timeout_sec=``.
 
     """
-    for _ in range(PATIENCE):
+    for _ in range(RETRIES):
         _spin(node, spin_once, DISCOVERY)
         if topics := _imu_topics(node):
             break
@@ -68,9 +68,9 @@ def look(node: Node, spin_once: Any) -> list[StreamFindings]:
     _spin(node, spin_once, 0.2)
     for stream in streams:
         stream.ask_for_what_is_offered()
-    for _ in range(PATIENCE):
-        _spin(node, spin_once, SECONDS)
-        if all(stream.count >= ENOUGH for stream in streams):
+    for _ in range(RETRIES):
+        _spin(node, spin_once, LISTEN_SECONDS)
+        if all(stream.count >= ENOUGH_MESSAGES for stream in streams):
             break
     return [stream.findings() for stream in streams]
 
@@ -78,7 +78,7 @@ def look(node: Node, spin_once: Any) -> list[StreamFindings]:
 def _imu_topics(node):
     """Return the published topics with Imu messages, or with names of Imu topics."""
     return [name for name, types in sorted(node.get_topic_names_and_types())
-            if (TYPE in types or name.endswith(NAMES)) and not name.endswith(NOT_MEASURED) and node.count_publishers(name)]
+            if (TYPE in types or name.endswith(IMU_TOPIC_ENDINGS)) and not name.endswith(NOT_MEASURED) and node.count_publishers(name)]
 
 
 def _spin(node, spin_once, seconds):
@@ -126,7 +126,7 @@ class _Stream:
             yield CheckFinding('publishers', WARNING, f'one node must publish a topic, {len(names)} do ({", ".join(names)}): their '
                                'messages mix; stop all but one, or rename their topics')
         if names and not self.heads.evidence().frame_ids:
-            yield CheckFinding('silence', WARNING, f'messages are required, none came in {PATIENCE * SECONDS:g} s; check the driver')
+            yield CheckFinding('silence', WARNING, f'messages are required, none came in {RETRIES * LISTEN_SECONDS:g} s; check the driver')
 
     def _listeners(self):
         wrong = 0

@@ -13,16 +13,16 @@ from rclpy.subscription import Subscription
 
 from imu_calibration.nodes.lifecycle import every
 
-DEPTH = 1000
+QUEUE_DEPTH = 1000
 """Messages that wait at most: a pause of 160 ms at 6 kHz, of 5 s at 200 Hz."""
 
 
-def input_qos(reliable: bool = False, depth: int = DEPTH) -> QoSProfile:
+def input_qos(reliable: bool = False, depth: int = QUEUE_DEPTH) -> QoSProfile:
     """Return the profile of an input (`inputs.MatchedInput`): `reliable` repeats lost messages, best effort accepts any publisher."""
     return _last(depth, ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
 
 
-def output_qos(depth: int = DEPTH) -> QoSProfile:
+def output_qos(depth: int = QUEUE_DEPTH) -> QoSProfile:
     """Return the profile of an output: reliable, so that every subscriber connects."""
     return _last(depth, ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)
 
@@ -36,7 +36,7 @@ def _last(depth: int, reliability: ReliabilityPolicy, durability: DurabilityPoli
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability)
 
 
-PERIOD = 0.25
+PUBLISHER_CHECK_SECONDS = 0.25
 """Seconds between two checks of the publishers of the inputs."""
 SEVERAL_AFTER = 3.0
 """Seconds after which several publishers of one topic are reported."""
@@ -46,7 +46,7 @@ NAP = 0.004
 """Seconds a callback sleeps after it has read all messages: at 2 kHz the executor then wakes once for eight messages."""
 NOT_RAW = ('_corrected', '/residual', '/truth')
 """Suffixes of topics that this package publishes, which are not suggested as replacements."""
-SHOWN = 3
+MAX_NAMED_TOPICS = 3
 """Other topics that are named at most."""
 
 
@@ -82,7 +82,7 @@ class MatchedInput:
 
     """
 
-    def __init__(self, node: Node, message_type: type, topic: str, *, callback: Callable[..., None], depth: int = DEPTH,
+    def __init__(self, node: Node, message_type: type, topic: str, *, callback: Callable[..., None], depth: int = QUEUE_DEPTH,
                  group: CallbackGroup | None = None, single: bool = True, raw: bool = True, latched: bool = False):
         self.node, self.message_type, self.topic, self.single = node, message_type, topic, single
         self._callback, self._depth, self._group, self._raw, self._latched = callback, depth, group, raw, latched
@@ -158,7 +158,7 @@ class MatchedInput:
                  and not name.endswith(NOT_RAW) and self.node.count_publishers(name)]
         if not there:
             return 'no topic of that type has a publisher'
-        near = get_close_matches(self.topic_name, there, SHOWN, 0.0)
+        near = get_close_matches(self.topic_name, there, MAX_NAMED_TOPICS, 0.0)
         more = f' (or {", ".join(near[1:])})' if near[1:] else ''
         return f'there is {near[0]}{more}; listen to it with -r {self.topic}:={near[0]}'
 
@@ -206,4 +206,4 @@ def watch_inputs(node: Node, inputs: list[MatchedInput]) -> None:
     def look() -> None:
         for each in inputs:
             each.look()
-    every(node, PERIOD, look)
+    every(node, PUBLISHER_CHECK_SECONDS, look)

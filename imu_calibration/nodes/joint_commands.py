@@ -22,7 +22,7 @@ from msg_adapters.joint_state import encode_trajectory
 
 COMMANDS = ('topic', 'action', 'auto')
 """How trajectories are sent; 'auto': by the action where control_msgs is installed and a server is there."""
-DEPTH = 10
+COMMAND_DEPTH = 10
 RESULTS = {-1: 'the goal is invalid', -2: 'the joints are not those of the controller', -3: 'the stamp is old', -4: 'a joint left the path',
            -5: 'a joint did not reach the end'}
 """Descriptions of the error codes of FollowJointTrajectory."""
@@ -32,7 +32,7 @@ class TopicCommand:
     """Sends trajectories to the topic `joint_trajectory`."""
 
     def __init__(self, node: Node):
-        self._publisher = node.create_publisher(JointTrajectory, 'joint_trajectory', output_qos(DEPTH))
+        self._publisher = node.create_publisher(JointTrajectory, 'joint_trajectory', output_qos(COMMAND_DEPTH))
         self.name = self.topic_name = self._publisher.topic_name
         self.action_name = f'{self.topic_name.rpartition("/")[0]}/follow_joint_trajectory'
         """Action of the same controller, by the convention of ros2_control."""

@@ -21,7 +21,7 @@ from imu_calibration.core.errors import ImuCalibrationError, shortened
 from imu_calibration.core.settings import describe
 from imu_calibration.nodes.parameters import meaning, settings_of, unknown_parameters, value_text
 
-WIDTH = 118
+HELP_WIDTH = 118
 
 
 def help_text(node_class: Callable[[], Any]) -> str:
@@ -33,7 +33,7 @@ def help_text(node_class: Callable[[], Any]) -> str:
     for group in settings_of(name):
         for item in describe(group):
             lines.append(f'  {item.name}: {value_text(item.default)}')
-            lines += textwrap.wrap(meaning(item), WIDTH, initial_indent='      ', subsequent_indent='      ')
+            lines += textwrap.wrap(meaning(item), HELP_WIDTH, initial_indent='      ', subsequent_indent='      ')
     return '\n'.join(lines)
 
 

@@ -7,13 +7,12 @@ from imu_calibration.compensation.covariance import is_known
 from imu_calibration.compensation.health import StopWatch
 from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import late_ns
+from imu_calibration.preprocessing.recording_evidence import ABSENT_MARK
 from msg_adapters.imu_stream import ImuStream
 from msg_adapters.layout import MessageError
 
-MANY = 30
+MAX_COUNTED_REASONS = 30
 """Largest number of reasons with separate counts: it bounds the memory."""
-ABSENT = -1.0
-"""First element of the covariance of a quantity that the message does not have."""
 
 
 class LiveCompensation(SampleCompensation):
@@ -100,7 +99,7 @@ class LiveCompensation(SampleCompensation):
             return False
         if self.frame_id and frame_id != self.frame_id:
             self._message.forget()
-            known = len(self.counts) < MANY or f"frame_id '{frame_id}'" in self.counts
+            known = len(self.counts) < MAX_COUNTED_REASONS or f"frame_id '{frame_id}'" in self.counts
             self.refuse(f"frame_id '{frame_id}'" if known else 'many further frame_ids')
             return False
         self._orientation_in = None
@@ -110,7 +109,7 @@ class LiveCompensation(SampleCompensation):
         """Propagate covariances that differ from the previous message's."""
         self._taken = self.revision
         given = self._message.covariances(data)
-        self._no_force, self._no_rate = absent = [bool(cov[0, 0] == ABSENT) for cov in given]
+        self._no_force, self._no_rate = absent = [bool(cov[0, 0] == ABSENT_MARK) for cov in given]
         self._absent = any(absent)
         self._odd = any(np.any(cov) and not missing and not is_known(cov) for cov, missing in zip(given, absent))
         found = list(self.covariances(*(None if missing else cov for cov, missing in zip(given, absent))))
@@ -138,6 +137,6 @@ class LiveCompensation(SampleCompensation):
         quaternion, covariance = self._message.orientation(data)
         if covariance != self._orientation_in:
             given = self._message.unpacked(covariance)
-            self._no_orientation, self._orientation_in = given[0, 0] == ABSENT, covariance
+            self._no_orientation, self._orientation_in = given[0, 0] == ABSENT_MARK, covariance
             self._orientation_out = covariance if self._no_orientation else self._message.packed(self.transfer.turned_covariance(given))
         return quaternion if self._no_orientation else self.transfer.turned_quaternion(quaternion), self._orientation_out

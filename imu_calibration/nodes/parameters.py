@@ -23,7 +23,7 @@ from imu_calibration.core.settings import Setting, describe, override
 RETIRED = {'reliable': 'inputs connect as their publishers offer',
            'diagnosis_samples': 'evenly spread windows are used, as in a recording'}
 """Parameters of earlier versions -> why they are not needed any more."""
-UNKNOWN = 'is unknown and ignored'
+UNKNOWN_PARAMETER = 'is unknown and ignored'
 """What is logged of a parameter that the node does not have."""
 NOT_OURS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 """Beginnings of the parameters that rclpy itself has."""
@@ -149,7 +149,7 @@ def unknown_parameters(node: Node) -> list[str]:
             continue
         known = list(node.get_parameters_by_prefix(''))
         near = get_close_matches(name, known, 1)
-        lines.append(f"parameter '{name}' {UNKNOWN}" + (f"; did you mean '{near[0]}'?" if near else
+        lines.append(f"parameter '{name}' {UNKNOWN_PARAMETER}" + (f"; did you mean '{near[0]}'?" if near else
                                                                      f"; see 'ros2 param list {node.get_fully_qualified_name()}'"))
     return lines
 

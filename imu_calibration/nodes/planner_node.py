@@ -39,7 +39,7 @@ from imu_calibration.kinematics.motion_limits import (
     range_warnings,
 )
 from imu_calibration.nodes.calibration_status import driven_markers
-from imu_calibration.nodes.complaints import ERROR, INFO, Complaints, say
+from imu_calibration.nodes.complaints import LOG_ERROR, LOG_INFO, Complaints, say
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.inputs import BatchInput, MatchedInput, latched_qos, watch_inputs
 from imu_calibration.nodes.joint_commands import OtherDrivers, make_command
@@ -94,7 +94,7 @@ def restricted_limits(limits: MotionLimits, position: np.ndarray, settings: Plan
     return limits.reached(position, settings.reach_deg) if settings.reach_deg else limits
 
 
-PERIOD = 0.1
+CLOCK_CHECK_SECONDS = 0.1
 """Seconds between two checks of the clock."""
 MID_MOTION = 'stopped in mid-motion'
 """Outcome of a node that ended during a motion."""
@@ -146,7 +146,7 @@ class PlannerNode(Node):
         self._calibrator = {what: self.create_client(Trigger, f'{settings.calibration_node}/{what}') for what in ('solve', 'diagnose')}
         for what, answer in (('start', lambda: self._go(-1)), ('next', lambda: self._go(1)), ('stop', self._stop)):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what, answer))
-        every(self, PERIOD, self._guarded(self._tick))
+        every(self, CLOCK_CHECK_SECONDS, self._guarded(self._tick))
         self._coverage, self._driven = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos()), None
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
@@ -245,7 +245,7 @@ class PlannerNode(Node):
         line = shortened(f'an internal error: {type(error).__name__}: {error}', 200)
         if self.driver.is_driving or self.worker.doing:
             self.worker.halt(f'{line}: stopped; start again, and report it')
-        self._complaints.event(line, ERROR)
+        self._complaints.event(line, LOG_ERROR)
         return line
 
     def _refused(self, why: str) -> None:
@@ -256,7 +256,7 @@ class PlannerNode(Node):
 
     def _stopped(self) -> None:
         self._stop_joints()
-        self._say(ERROR, self.driver.reason)
+        self._say(LOG_ERROR, self.driver.reason)
 
     def _stop_joints(self) -> None:
         if not self.context.ok():
@@ -284,7 +284,7 @@ class PlannerNode(Node):
             raise InputError(f"calibration must answer ~/solve within {ANSWER_PATIENCE:g} s, '{self.settings.calibration_node}' did not; "
                              "check that it runs")
         if not answer.success:
-            self._say(INFO, f'no calibration yet: {answer.message}')
+            self._say(LOG_INFO, f'no calibration yet: {answer.message}')
             return None
         with self._heard:
             self._heard.wait_for(lambda: self._n_documents > known, timeout=2.0)
@@ -294,7 +294,7 @@ class PlannerNode(Node):
         known = self._told.get('diagnoses', '0')
         answer = self._ask('diagnose')
         if answer is None or not answer.success:
-            self._say(INFO, 'no diagnosis: ' + (answer.message if answer else 'no answer'))
+            self._say(LOG_INFO, 'no diagnosis: ' + (answer.message if answer else 'no answer'))
             return None
         with self._heard:
             came = self._heard.wait_for(lambda: self._told.get('diagnoses', '0') != known and self._told.get('being made') == 'False',
@@ -340,7 +340,7 @@ class PlannerNode(Node):
             response.success, response.message = False, error.told(HINTS['planner_node'])
         except Exception as error:
             response.success, response.message = False, self._failed(error)
-        self._say(INFO if response.success else ERROR, f'~/{what}: {response.message}')
+        self._say(LOG_INFO if response.success else LOG_ERROR, f'~/{what}: {response.message}')
         self._diagnostics.publish_now()
         return response
 

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND, MATES, SIZE
+from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND, MATES_KEY, SIZE_KEY
 from imu_calibration.core.errors import ImuCalibrationError, InputError, shortened
-from imu_calibration.nodes.complaints import ERROR, INFO
+from imu_calibration.nodes.complaints import LOG_ERROR, LOG_INFO
 from imu_calibration.planning.campaign import Campaign, Suspect
 from imu_calibration.planning.driver import Driver, DriveState
 
-PERIOD = 0.05
+DRIVER_CHECK_SECONDS = 0.05
 """Seconds between two checks of the driver."""
 
 
@@ -124,7 +124,7 @@ class PlannerWorker(threading.Thread):
     def run(self) -> None:
         """Work until `end`."""
         while not self._ending:
-            self._wake.wait(PERIOD)
+            self._wake.wait(DRIVER_CHECK_SECONDS)
             self._wake.clear()
             if self._wanted and not self.driver.is_driving:
                 try:
@@ -139,7 +139,7 @@ class PlannerWorker(threading.Thread):
         if self.driver.state is not DriveState.STOPPED:
             self.halt(why)
         self._wanted = 0
-        self._peers.say(ERROR, why)
+        self._peers.say(LOG_ERROR, why)
 
     def _next(self):
         if self.driver.state is DriveState.STOPPED:   # because of the joint states
@@ -154,10 +154,10 @@ class PlannerWorker(threading.Thread):
         decision = self._decide()
         while decision is not None and decision.diagnose:
             self.doing = Activity.DIAGNOSING
-            self._peers.say(INFO, f'{decision.why}; diagnosing')
+            self._peers.say(LOG_INFO, f'{decision.why}; diagnosing')
             asked = self.campaign.take_findings(self._peers.diagnose())
             if asked:
-                self._peers.say(INFO, asked)
+                self._peers.say(LOG_INFO, asked)
             if (calibration := self._peers.latest()) is not None:
                 self.campaign.take(calibration)
             decision = self._decide()
@@ -176,7 +176,7 @@ class PlannerWorker(threading.Thread):
                 self.doing, end = Activity.AWAITING_STOP, time.monotonic() + patience
             if time.monotonic() > end:
                 raise InputError(f'the joints must rest before a motion begins, they moved for {patience:g} s; find the cause')
-            self._wake.wait(PERIOD)
+            self._wake.wait(DRIVER_CHECK_SECONDS)
             self._wake.clear()
 
     def _measure(self):
@@ -204,7 +204,7 @@ class PlannerWorker(threading.Thread):
             self._wanted = 0
             with self._lock:
                 self.driver.finish(decision.why)
-            self._peers.say(INFO, f'done after {self.driver.motions} motions: {decision.why}')
+            self._peers.say(LOG_INFO, f'done after {self.driver.motions} motions: {decision.why}')
             return
         self._wait_for_rest()   # the joints may have been turned during planning
         if obstacle := self._peers.obstacle():
@@ -216,13 +216,14 @@ class PlannerWorker(threading.Thread):
             self.motion, self.seconds = decision.motion, points.duration
             self._began = self.stamp() if self._began is None else self._began
             self._peers.send(points)
-        self._peers.say(INFO, f'motion {self.driver.motions}, {points.duration:.0f} s: {decision.motion.words}; {decision.why}')
+        self._peers.say(LOG_INFO, f'motion {self.driver.motions}, {points.duration:.0f} s: {decision.motion.words}; {decision.why}')
 
 
 def findings_from(told: dict[str, str]) -> list[Suspect]:
     """Return the model errors in the values of calibration_node's status 'diagnosis', the strongest first."""
     if told.get('outcome') != FOUND:
         return []
-    found = [(key.removeprefix(MATES), value.split()) for key, value in told.items() if key.startswith(MATES)]
-    return [Suspect(effect, tuple(mates), {key.removeprefix(f'{SIZE}{each}.'): float(value) for each in (effect, *mates)
-                                           for key, value in told.items() if key.startswith(f'{SIZE}{each}.')}) for effect, mates in found]
+    found = [(key.removeprefix(MATES_KEY), value.split()) for key, value in told.items() if key.startswith(MATES_KEY)]
+    return [Suspect(effect, tuple(mates), {key.removeprefix(f'{SIZE_KEY}{each}.'): float(value) for each in (effect, *mates)
+                                           for key, value in told.items() if key.startswith(f'{SIZE_KEY}{each}.')})
+            for effect, mates in found]

@@ -16,7 +16,7 @@ AHEAD = 3
 """Batches that are made ahead of their time."""
 SHORTEST_SLEEP = 0.001
 """Seconds; messages that are due by then are published together."""
-DEPTH = 20_000
+PLAYBACK_DEPTH = 20_000
 """Messages that wait for a slow reliable subscriber: some seconds of a fast stream."""
 
 

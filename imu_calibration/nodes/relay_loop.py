@@ -24,7 +24,7 @@ try:
 except ImportError:
     _inner = None
 
-BATCH = 256
+MAX_MESSAGES_IN_ROW = 256
 """Largest number of messages read in a row before the context is checked."""
 WAIT_NS = 100_000_000
 """Longest wait, s, after which a replaced subscription is noticed; a signal ends it at once."""
@@ -121,7 +121,7 @@ def _drain_one(context, source, wait_set, guard, publish, convert):
             wait_set.add_subscription(subscription.handle)
             wait_set.add_guard_condition(guard.handle)
             wait_set.wait(WAIT_NS)
-            for _ in range(BATCH):
+            for _ in range(MAX_MESSAGES_IN_ROW):
                 taken = take(message_type, True)
                 if taken is None:
                     break

@@ -17,12 +17,12 @@ from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import StaticTransforms, root_of, table_from_urdf
-from imu_calibration.nodes.complaints import WARNING, say
+from imu_calibration.nodes.complaints import LOG_WARN, say
 from imu_calibration.nodes.inputs import latched_qos
 from msg_adapters.layout import clean_name
 
 TF_STATIC = '/tf_static'
-DEPTH = 100
+TRANSFORM_DEPTH = 100
 """Publishers of static transforms whose last message is wanted."""
 
 
@@ -69,15 +69,15 @@ class StaticFrames:
             except ImportError as error:
                 raise InputError(f'{TF_STATIC} needs the messages of the package tf2_msgs, which is not installed; '
                                  'install ros-jazzy-tf2-msgs, or give target_xyz and target_rpy', code='package_missing') from error
-            qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            qos = QoSProfile(depth=TRANSFORM_DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             self._subscription = self._node.create_subscription(TFMessage, TF_STATIC, self.take, qos)
 
 
-TOPIC = 'topic'
+URDF_FROM_TOPIC = 'topic'
 """Value of `urdf_file` that selects the topic robot_description."""
 NO_TABLE = ('', 'none')
 """Values of `table_file` that mean: none. Launch arguments cannot be empty."""
-STEP, PATIENCE = 0.1, 5.0
+WAIT_SECONDS, WAIT_LOG_SECONDS = 0.1, 5.0
 """Seconds of one wait; after each the awaited message is logged."""
 Found = TypeVar('Found')
 
@@ -87,7 +87,7 @@ class RobotSettings:
     """The arm that carries the IMU."""
 
     urdf_file: str = setting('', '', "description (.urdf, or .xacro with allow_xacro) of the arm that carries the IMU, path; "
-                             f"{TOPIC}: the topic robot_description; empty: "
+                             f"{URDF_FROM_TOPIC}: the topic robot_description; empty: "
                              'table_file only. With an arm, table_file describes the site: up, gravity, latitude, '
                              'limits of joints by name',
                              symptom='the node waits for the missing input', session=True, path=True,
@@ -128,7 +128,7 @@ def chain_of(node: Node, robot: RobotSettings, table_file: str, *, frame_id: str
     if not robot.urdf_file:
         return None if place is None else files.read_table(place)
     site = {} if place is None else files.read_mapping(place, 'table description')
-    text = (_topic_text(node) if robot.urdf_file == TOPIC
+    text = (_topic_text(node) if robot.urdf_file == URDF_FROM_TOPIC
             else files.read_robot_description(files.user_path(robot.urdf_file), robot.allow_xacro))
     link = robot.imu_link or frame_id or clean_name(_message(node, Imu, 'imu/data_raw', qos_profile_sensor_data).header.frame_id)
     if robot.world_frame:
@@ -140,7 +140,7 @@ def words_of(robot: RobotSettings, table_file: str) -> str:
     """Return a description of the result of `chain_of`."""
     if not robot.urdf_file:
         return f'the table {files.user_path(table_file)}'
-    return 'the arm of the topic robot_description' if robot.urdf_file == TOPIC else f'the arm {files.user_path(robot.urdf_file)}'
+    return 'the arm of the topic robot_description' if robot.urdf_file == URDF_FROM_TOPIC else f'the arm {files.user_path(robot.urdf_file)}'
 
 
 def _topic_text(node):
@@ -148,7 +148,7 @@ def _topic_text(node):
         try:
             return bool(root_of(message.data))
         except InputError as error:   # anybody can publish on the topic
-            say(node.get_logger(), WARNING, f'a robot description was ignored: {error}')
+            say(node.get_logger(), LOG_WARN, f'a robot description was ignored: {error}')
             return False
     return _message(node, String, 'robot_description', latched_qos(), is_robot).data
 
@@ -175,11 +175,11 @@ def _waited_for(node: Node, look: Callable[[], Found | None], what: Callable[[],
     """Return the first result of `look` that is not None; raises an ExternalShutdownException when the context ends before."""
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    said = time.monotonic() - PATIENCE + 1.0
+    said = time.monotonic() - WAIT_LOG_SECONDS + 1.0
     try:
         while (found := look()) is None:
-            executor.spin_once(timeout_sec=STEP)
-            if time.monotonic() - said > PATIENCE:
+            executor.spin_once(timeout_sec=WAIT_SECONDS)
+            if time.monotonic() - said > WAIT_LOG_SECONDS:
                 node.get_logger().info(f'waits for {what()}')
                 said = time.monotonic()
         return found

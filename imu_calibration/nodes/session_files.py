@@ -15,7 +15,7 @@ from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 
-DEFAULT = 'calibration.yaml'
+DEFAULT_FILE = 'calibration.yaml'
 
 
 class SessionFiles:
@@ -25,13 +25,13 @@ class SessionFiles:
     Parameters
     ----------
     save_file : str
-        Path of the calibration; '': `DEFAULT` in the working directory, and files are saved on request only.
+        Path of the calibration; '': `DEFAULT_FILE` in the working directory, and files are saved on request only.
 
     """
 
     def __init__(self, save_file: str):
         self.given = bool(save_file)
-        self.calibration = files.user_path(save_file or DEFAULT)
+        self.calibration = files.user_path(save_file or DEFAULT_FILE)
         self.saved_at, self.n_saved = time.monotonic(), 0
         for path in (self.calibration, self.accumulator):
             files.remove_leftovers(path)

@@ -33,7 +33,7 @@ from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, ma
 from imu_calibration.nodes.inputs import latched_qos, output_qos
 from imu_calibration.nodes.lifecycle import announce, run_node
 from imu_calibration.nodes.parameters import HINTS, declare_parameters
-from imu_calibration.nodes.playback import DEPTH, Batch, Pace, Playback
+from imu_calibration.nodes.playback import PLAYBACK_DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.simulation.live import LiveSimulation
 from imu_calibration.simulation.profiles import make_profile
@@ -44,7 +44,7 @@ from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import trajectory_from_message
 from msg_adapters.write import encode_imu, encode_joints, encode_temperature, rows
 
-STRETCH = 0.1
+STRETCH_SECONDS = 0.1
 """Seconds of simulated time that are computed together, times the time factor; as playback makes some such stretches ahead, a
 trajectory is effective about half a second later."""
 
@@ -113,7 +113,7 @@ class SimulatorNode(Node):
         self._publish_truth(model, values)
         kinds = [(Imu, 'imu/data_raw'), (JointState, 'joint_states')]
         kinds += [(Temperature, 'imu/temperature')] * settings.temperature + [(Imu, 'imu/truth')] * settings.truth
-        publishers = [self.create_publisher(kind, topic, output_qos(DEPTH)) for kind, topic in kinds]
+        publishers = [self.create_publisher(kind, topic, output_qos(PLAYBACK_DEPTH)) for kind, topic in kinds]
         self._to = dict(zip([topic for _, topic in kinds], publishers, strict=True))
         pace = Pace(settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers)
         self._playback = Playback(self, publishers, self._batches(), pace=pace, clock_start_ns=start_ns, awaited=publishers[:1],
@@ -170,7 +170,7 @@ class SimulatorNode(Node):
 
     def _batches(self):
         """Yield Batch after Batch; a received trajectory starts between two of them."""
-        until, step = 0.0, STRETCH * max(self.settings.time_factor, 1.0)
+        until, step = 0.0, STRETCH_SECONDS * max(self.settings.time_factor, 1.0)
         while until < self._motion.end or not self.settings.stop_at_end:
             while not self._trajectories.empty():
                 self._take_over(until, self._trajectories.get())

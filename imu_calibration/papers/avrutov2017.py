@@ -10,7 +10,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.papers.linear_least_squares import LinearSolution, solve_linear
 
-COLUMNS = {
+MODEL_COLUMNS = {
     'linear': ('bias', 'x', 'y', 'z'),
     'products': ('bias', 'x', 'y', 'z', 'xy', 'yz', 'xz'),
     'quadratic': ('bias', 'x', 'y', 'z', 'xy', 'yz', 'xz', 'xx', 'yy', 'zz'),
@@ -35,7 +35,7 @@ def nominal_gyroscopes(model: str = 'products', n11: float = 0.1) -> np.ndarray:
 
 def _stacked(bias, matrix, model):
     products = np.full((3, 3), 1e-3) - 2e-3 * np.eye(3)
-    return np.vstack([np.full(3, bias), matrix.T, products.T])[:len(COLUMNS[model])]
+    return np.vstack([np.full(3, bias), matrix.T, products.T])[:len(MODEL_COLUMNS[model])]
 
 
 def turn(order: str, angles: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
@@ -111,12 +111,12 @@ def add_earth_rate(rate_deg_s: np.ndarray, along_spin_axis_deg_s: float,
 
 
 def design_matrix(inputs: np.ndarray, model: str = 'linear') -> np.ndarray:
-    """Return G (eq. 2, 5) or omega (eq. 8, 11), shape (n, n_params), columns as in `COLUMNS`."""
-    if model not in COLUMNS:
-        raise InputError(f"model must be one of {', '.join(COLUMNS)}, got '{model}'; choose one of them", code='model_unknown')
+    """Return G (eq. 2, 5) or omega (eq. 8, 11), shape (n, n_params), columns as in `MODEL_COLUMNS`."""
+    if model not in MODEL_COLUMNS:
+        raise InputError(f"model must be one of {', '.join(MODEL_COLUMNS)}, got '{model}'; choose one of them", code='model_unknown')
     x, y, z = np.asarray(inputs, float).T
     known = {'bias': np.ones_like(x), 'x': x, 'y': y, 'z': z, 'xy': x * y, 'yz': y * z, 'xz': x * z, 'xx': x * x, 'yy': y * y, 'zz': z * z}
-    return np.column_stack([known[name] for name in COLUMNS[model]])
+    return np.column_stack([known[name] for name in MODEL_COLUMNS[model]])
 
 
 def calibrate(inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear', *, weights: np.ndarray | None = None) -> LinearSolution:
@@ -143,7 +143,7 @@ def calibrate(inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear', *,
         When the turns do not determine every column.
 
     """
-    return solve_linear(design_matrix(inputs, model), outputs, COLUMNS[model], weights=weights)
+    return solve_linear(design_matrix(inputs, model), outputs, MODEL_COLUMNS[model], weights=weights)
 
 
 def calibrate_as_printed(inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear') -> np.ndarray:
@@ -217,7 +217,7 @@ def calibrate_with_tilt(mat_bn: np.ndarray, outputs: np.ndarray, gravity_axis: s
         When the positions do not separate tilt from matrix.
 
     """
-    names = tuple(f'{column}_{sensor}' for sensor in 'xyz' for column in COLUMNS['linear']) + ('tilt_1', 'tilt_2')
+    names = tuple(f'{column}_{sensor}' for sensor in 'xyz' for column in MODEL_COLUMNS['linear']) + ('tilt_1', 'tilt_2')
     tilt = np.zeros(2)
     coefficients = calibrate(gravity_readings(mat_bn, gravity_axis), outputs).values
     for _ in range(iterations):

@@ -20,11 +20,11 @@ from imu_calibration.planning.coordinates import Coordinates
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.simulation.motion_builder import Profile, Segment
 
-ROUNDS = 600
+MAX_WEIGHT_STEPS = 600
 """Steps of the multiplicative algorithm; the certificate is mostly within a few per cent after 200."""
-LONGEST = 1e7
+MAX_REACHABLE_SECONDS = 1e7
 """Tolerances that are not met after this time for every motion are out of reach, s."""
-CLOSE = 1.01
+CERTIFICATE_RATIO = 1.01
 """The search ends when the relaxed value is within this factor of the certificate."""
 
 
@@ -62,14 +62,14 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
     weights = np.full(len(asked), 1.0 / len(asked))
     if _worst(known, asked) <= 1.0:
         return Relaxation(0.0, 0.0, weights)
-    if _worst(known + LONGEST * np.sum(information / seconds[:, None, None], axis=0), asked) > 1.0:
+    if _worst(known + MAX_REACHABLE_SECONDS * np.sum(information / seconds[:, None, None], axis=0), asked) > 1.0:
         return Relaxation(np.nan, np.nan, weights)
     flat = used = information.reshape(len(seconds), -1)
     kept, root = np.arange(len(seconds)), np.linalg.cholesky(known)
     rows = scipy.linalg.solve_triangular(root, asked.T, lower=True).T
     share = 1.0 / len(seconds) / seconds
     best = Relaxation(0.0, np.inf, weights)
-    for number in range(ROUNDS):
+    for number in range(MAX_WEIGHT_STEPS):
         direction = np.tensordot(share[kept], used, 1).reshape(known.shape)
         scale = _scale(direction, root, rows)
         covariance = inverse_normal(known + scale * direction)   # nearly singular in unreachable directions
@@ -79,13 +79,13 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
         worth = np.zeros(len(seconds))
         worth[kept] = used @ prices.ravel() / seconds[kept]
         relaxed = scale * float(share @ seconds)
-        if number % 25 == 0 or number == ROUNDS - 1:
+        if number % 25 == 0 or number == MAX_WEIGHT_STEPS - 1:
             worth = flat @ prices.ravel() / seconds
             factor = 1.0 / worth.max()
             bound = factor * (weights @ (2 * variance - 1) - np.sum(known * prices))
             if bound > best.seconds:
                 best = Relaxation(float(bound), relaxed, weights)
-            if relaxed < CLOSE * best.seconds:
+            if relaxed < CERTIFICATE_RATIO * best.seconds:
                 break
             kept = np.flatnonzero((worth > 0.3 * worth.max()) | (share * seconds > 1e-4 * (share @ seconds)))
             used = flat[kept]
@@ -118,7 +118,7 @@ SAMPLING = 16.0
 """Instants per second at which columns are evaluated: a turn at 300 deg/s has 19."""
 LEAST_INSTANTS = 4
 """Instants of a rest, where columns are all one and the bias wanders, and of the shortest motion."""
-BLOCK = 8192
+BELIEF_BLOCK_ROWS = 8192
 """Instants whose columns are held in memory at a time."""
 WINDOWS = {'rest': 'static', 'spin': 'spin'}
 """Segment -> window; all remaining segments are dynamic."""
@@ -171,7 +171,7 @@ class WindowPredictor:
         """Return the windows of each of several motions, a tuple of segments each."""
         cuts = [list(self._cut(segments)) for segments in motions]
         flat = [cut for one in cuts for cut in one]
-        blocks = np.cumsum([len(cut[0]) for cut in flat]) // BLOCK
+        blocks = np.cumsum([len(cut[0]) for cut in flat]) // BELIEF_BLOCK_ROWS
         wander = cache(self._wander)   # many motions last equally long, at least a move and its way back
         windows = iter([window for block in np.unique(blocks)
                         for window in self._windows([flat[k] for k in np.flatnonzero(blocks == block)], wander)])

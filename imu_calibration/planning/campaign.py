@@ -132,9 +132,9 @@ def _require_shown_by_motion(model, key):
 
 TIME_OVER = 'the time given is over'
 IN_VAIN = 'motions no longer reduce the standard deviations as planned: the limit is not noise'
-PATIENCE = 6
+STALL_MOTIONS = 6
 """Motions after which the standard deviations must have decreased."""
-LEAST_SHARE = 0.93
+MAX_REMAINING_SHARE = 0.93
 """Largest share of the logarithms of excess over tolerance that may remain after them; otherwise further motions do not pay."""
 
 
@@ -297,7 +297,7 @@ class Campaign:
     @property
     def _promises_in_vain(self):
         """Whether the last motions gave almost none of the predicted reduction."""
-        return len(self._left) > PATIENCE and self._left[-1] > LEAST_SHARE * self._left[-1 - PATIENCE] > 0
+        return len(self._left) > STALL_MOTIONS and self._left[-1] > MAX_REMAINING_SHARE * self._left[-1 - STALL_MOTIONS] > 0
 
     def _outside(self):
         missing = [name for name, excess in self.planner.excess.items() if excess > 1.0]
@@ -312,7 +312,7 @@ class Campaign:
         return '; beyond bias and matrix there is ' + ', '.join(each.effect + text for each, text in zip(self.findings, mates, strict=True))
 
 
-LONGEST = 180.0
+MAX_SEPARATING_SECONDS = 180.0
 """Causes that no plan of this length separates count as one cause for this table, s."""
 
 
@@ -349,7 +349,7 @@ def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, no
     causes = [(sensors[name], name) for name in (suspect.effect, *suspect.mates)]
     planner = make_separator(table, with_suspect(calibration, causes[0], suspect.sizes), causes, noise=noise, rate=rate, options=options,
                              sizes=suspect.sizes, limits=limits)
-    planner.within(LONGEST)
+    planner.within(MAX_SEPARATING_SECONDS)
     return planner
 
 

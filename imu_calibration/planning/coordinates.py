@@ -17,7 +17,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.weighted_system import fixed_parameters, make_prior
 from imu_calibration.selection.search import FAMILY_WISE, TIE
 
-EXACT = 1e-4
+KNOWN_SHARE = 1e-4
 """A parameter counts as known if its sd is below this share of its tolerance."""
 
 
@@ -89,8 +89,8 @@ class Coordinates:
         scaled = covariance[np.ix_(theirs, theirs)] / np.outer(self.units[own], self.units[own])
         basis = self.basis[own]
         values, vectors = scipy.linalg.eigh((scaled + scaled.T) / 2)
-        # Directions that the gauge fixes have no variance and no component in the basis; EXACT is as good as certain.
-        rows = (vectors.T @ basis) / np.sqrt(np.maximum(values, max(1e-13 * values.max(), EXACT**2)))[:, None]
+        # Directions that the gauge fixes have no variance and no component in the basis; KNOWN_SHARE is as good as certain.
+        rows = (vectors.T @ basis) / np.sqrt(np.maximum(values, max(1e-13 * values.max(), KNOWN_SHARE**2)))[:, None]
         known = rows.T @ rows - self.prior_information
         weights, directions = scipy.linalg.eigh((known + known.T) / 2)
         return (directions * np.maximum(weights, 0.0)) @ directions.T
@@ -107,7 +107,7 @@ def _basis(gauge):
     return basis
 
 
-POWER = 0.95
+SEPARATION_PROBABILITY = 0.95
 """Probability with which causes are to be separated."""
 
 
@@ -219,7 +219,7 @@ class ToldApart:
 
 def enough(size: int, questions: int) -> float:
     """
-    Return the noncentrality with which an effect of this number of parameters is identified and preferred with probability POWER.
+    Return the noncentrality that identifies and prefers an effect of this number of parameters with SEPARATION_PROBABILITY.
 
     Named: its chi-square beyond the search's threshold for so many questions. Preferred: of two models of which one is right the
     logarithm of the likelihood ratio is normal with mean ``lambda / 2`` and variance ``lambda``; it must exceed the search's TIE.
@@ -227,6 +227,6 @@ def enough(size: int, questions: int) -> float:
     from scipy.stats import ncx2  # here, because its import is slow
 
     threshold = chi2_isf(FAMILY_WISE / questions, size)
-    named = next(value for value in np.geomspace(1.0, 1e4, 2000) if ncx2.sf(threshold, size, value) >= POWER)
-    quantile = norm_ppf(POWER)
+    named = next(value for value in np.geomspace(1.0, 1e4, 2000) if ncx2.sf(threshold, size, value) >= SEPARATION_PROBABILITY)
+    quantile = norm_ppf(SEPARATION_PROBABILITY)
     return float(max(named, (quantile + np.sqrt(quantile**2 + 2 * TIE))**2))

@@ -12,13 +12,11 @@ from imu_calibration.core.settings import setting
 from imu_calibration.core.units import DEG
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
 from imu_calibration.planning.path_watch import PathWatch, at_rest
-from imu_calibration.simulation.table_controller import excess, trajectory_from
+from imu_calibration.simulation.table_controller import LIMIT_ROUNDING, excess, trajectory_from
 
-MARGIN = 1e-6
-"""Relative excess of a trajectory over a limit that is accepted as rounding."""
 OVERSPEED = 1.25
 """Measured speed in units of the limit from which the joints are stopped; rates from encoders are noisy."""
-STILL = 0.1
+MAX_REST_MOVEMENT = 0.1
 """Tolerances by which joints that rest may move: encoders are noisy, arms sag."""
 
 
@@ -172,7 +170,7 @@ class Driver:
                              code='joints_moving')
         points = points.ordered(self.joint_names).slowed(self.settings.first_speed if self._slow else 1.0)
         self._require_within_limits(points)
-        is_small = np.all(np.abs(points.position - self.position) <= self.first_reach + STILL * self.tolerance)
+        is_small = np.all(np.abs(points.position - self.position) <= self.first_reach + MAX_REST_MOVEMENT * self.tolerance)
         self._watch, self._slow = PathWatch(self.position, points, self.tolerance), self._slow and bool(is_small)
         self.motions += 1
         self._become(DriveState.MOVING, words)
@@ -185,7 +183,7 @@ class Driver:
         # A joint whose encoder reads slightly outside its range may return into it.
         outside = np.maximum(self.limits.lower - self.position, self.position - self.limits.upper)
         beyond -= max(float(np.max(outside)), 0.0)
-        if beyond > MARGIN or max(speed, acceleration) > 1.0 + MARGIN or points.acceleration is None:
+        if beyond > LIMIT_ROUNDING or max(speed, acceleration) > 1.0 + LIMIT_ROUNDING or points.acceleration is None:
             raise InputError('a motion must have accelerations and stay within the limits of the joints, it leaves the range by '
                              f'{max(beyond, 0.0):.3g} rad or m and reaches {speed:.3f} of the speed and {acceleration:.3f} of the '
                              'acceleration; it is not sent', code='joint_limits')
@@ -302,7 +300,7 @@ class Driver:
     def _note_rest(self):
         """Restart the timer when the joints have moved, or their clock was set back."""
         if (self._rested_at is None or self._time < self._rested_since
-                or np.any(np.abs(self.position - self._rested_at) > STILL * self.tolerance)):
+                or np.any(np.abs(self.position - self._rested_at) > MAX_REST_MOVEMENT * self.tolerance)):
             self._rested_at, self._rested_since = self.position, self._time
 
     def _settle(self):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.advice import foretold, knowledge_at_first
-from imu_calibration.calibration.hand_step import HOLD, TURN_RATE, HandStep
+from imu_calibration.calibration.hand_step import HOLD_TIME, TURN_RATE, HandStep
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.references.gravity.hand_parameters import HandModel
 
@@ -51,7 +51,7 @@ def plan_by_hand(model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str
         Samples per second.
 
     """
-    force_sd, rate_sd = (float(np.sqrt(noise[s].low_variance.mean() / (HOLD * rate) + sum(p.sd**2 for p in noise[s].bias_processes)))
+    force_sd, rate_sd = (float(np.sqrt(noise[s].low_variance.mean() / (HOLD_TIME * rate) + sum(p.sd**2 for p in noise[s].bias_processes)))
                          for s in ('accelerometer', 'gyroscope'))
     turn_sd = float(np.sqrt(noise['gyroscope'].low_variance.mean() * (np.pi / TURN_RATE) / rate))
     knowledge = knowledge_at_first(model, tolerances, noise=(force_sd, rate_sd, turn_sd))

@@ -10,20 +10,20 @@ from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from imu_calibration.simulation.table_controller import trajectory_from
 
-STEP = 0.01
+PATH_STEP_SECONDS = 0.01
 """Step of the instants at which the path is evaluated, s."""
-REACH = 0.1
+MAX_LEAD_SECONDS = 0.1
 """Largest progress in excess of the elapsed time between two joint states, s: stamps jitter."""
 DEAD_BAND = 0.5
 """Places of the path as near as this, in tolerances, fit alike: turning points of swings look the same
 from both sides, and arms sag."""
-SLOWEST = 0.05
+MIN_PACE = 0.05
 """Least share of its speed at which a path is thought to be followed."""
-MOVED = 0.4
+MIN_BEGUN_MOVEMENT = 0.4
 """Tolerances from where they were by which joints have begun to move."""
-MEMORY = 1.0
+STALLED_SECONDS = 1.0
 """Seconds of motion that identify a joint that does not move."""
-FAST = 0.05
+MAX_REST_RATE = 0.05
 """Largest rate at which a path counts as at rest, in tolerances per second."""
 
 
@@ -33,7 +33,7 @@ def at_rest(position: np.ndarray) -> JointMotion:
     return JointMotion(np.zeros(1), np.asarray(position, float)[None], zero, zero, zero)
 
 
-TIE = 1e-3
+LATENESS_TIE = 1e-3
 """Of joints that are equally late, the one that has moved least is named; after a motion there and back all may be where they began."""
 
 
@@ -56,13 +56,13 @@ class PathWatch:
 
     def __init__(self, start: np.ndarray, points: TrajectoryPoints, tolerance: np.ndarray):
         path = trajectory_from(at_rest(start), points)
-        count = max(int(np.ceil(points.duration / STEP)), 1)
+        count = max(int(np.ceil(points.duration / PATH_STEP_SECONDS)), 1)
         self._time = np.linspace(0.0, points.duration, count + 1)
         motion = path.at(self._time)
         self._path, self.tolerance = motion.position / tolerance, np.asarray(tolerance, float)
         # The rate of the spline may vanish where an oscillation reverses: rest means no motion over several steps.
         moved = np.max(np.abs(np.diff(self._path, axis=0, prepend=self._path[:1])), axis=1)
-        self._rests = moved < FAST * STEP
+        self._rests = moved < MAX_REST_RATE * PATH_STEP_SECONDS
         edge = np.append(np.flatnonzero(~self._rests), len(self._time) - 1)
         self._rest_end = edge[np.searchsorted(edge, np.arange(len(self._time)))]
         self._at, self._start = 0, np.asarray(start, float) / tolerance
@@ -91,7 +91,7 @@ class PathWatch:
     @property
     def pace(self) -> float:
         """Speed of the joints along the path as a share of the speed of the path."""
-        return float(np.clip(self._came / self._took, SLOWEST, 1.0)) if self._took > 0 else 1.0
+        return float(np.clip(self._came / self._took, MIN_PACE, 1.0)) if self._took > 0 else 1.0
 
     @property
     def has_stalled_for(self) -> float:
@@ -109,14 +109,14 @@ class PathWatch:
         self._remember(time, place)
         rests = self._rests[self._at]
         # Joints may end a rest before the scheduled time, so its end is evaluated as well.
-        stop = np.searchsorted(self._time, self._time[self._rest_end[self._at]] + elapsed + REACH, side='right')
+        stop = np.searchsorted(self._time, self._time[self._rest_end[self._at]] + elapsed + MAX_LEAD_SECONDS, side='right')
         ahead = slice(self._at, max(stop, self._at + 1))
         away = np.max(np.abs(self._path[ahead] - place), axis=1)
         fits = np.flatnonzero(away <= max(DEAD_BAND, np.min(away)))
         # The remainder below a step is kept; otherwise a slow pace would never end a rest.
         expected = self.progress + self._remainder + elapsed * (self.pace if rests else 1.0)
         before, self._at = self._at, self._at + int(fits[np.argmin(np.abs(self._time[ahead][fits] - expected))])
-        self._remainder = float(np.clip(expected - self.progress, -STEP, STEP))
+        self._remainder = float(np.clip(expected - self.progress, -PATH_STEP_SECONDS, PATH_STEP_SECONDS))
         self.deviation = np.abs(self._path[self._at] - place)
         further = self._at > before or self.at_end
         if further and not rests and self.has_begun:
@@ -127,9 +127,9 @@ class PathWatch:
 
     def _remember(self, time, place):
         self._most = np.maximum(self._most, np.abs(place - self._start))
-        self.has_begun = self.has_begun or bool(np.max(self._most) > MOVED)
+        self.has_begun = self.has_begun or bool(np.max(self._most) > MIN_BEGUN_MOVEMENT)
         self._recent.append((time, place))
-        while len(self._recent) > 2 and time - self._recent[0][0] > MEMORY:
+        while len(self._recent) > 2 and time - self._recent[0][0] > STALLED_SECONDS:
             self._recent.popleft()
 
     @property
@@ -139,10 +139,10 @@ class PathWatch:
 
     def suspect(self) -> int:
         """Return the joint with the smallest share of the commanded motion: before this point after a deviation, after it in a stall."""
-        near, place = int(MEMORY * self.pace / STEP) + 1, self._recent[-1][1]
+        near, place = int(STALLED_SECONDS * self.pace / PATH_STEP_SECONDS) + 1, self._recent[-1][1]
         if self.has_strayed:
             wanted = np.ptp(self._path[max(self._at - near, 0):self._at + 1], axis=0)
         else:   # distance to the following path: of joints with equal motion, a joint that has arrived is not the cause
             wanted = np.max(np.abs(self._path[self._at:self._at + near + 1] - place), axis=0)
         moved = np.ptp(np.array([place for _, place in self._recent]), axis=0)
-        return int(np.argmax(wanted - moved - TIE * self._most))
+        return int(np.argmax(wanted - moved - LATENESS_TIE * self._most))

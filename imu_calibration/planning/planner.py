@@ -22,11 +22,11 @@ from imu_calibration.planning.situation import PROBABILITY, Situation
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 
-MOST_MOTIONS = 400
+MAX_PLAN_MOTIONS = 400
 """Motions of a plan at most."""
 FURTHER = 1.02
 """Factor on standard deviations when the belief thinks itself at the goal and the exact weights do not."""
-LEAST_GAIN = 2e-3
+MIN_PLAN_GAIN = 2e-3
 """A motion must lower the sum of logarithms of excess over tolerance by so much to be worth it, near the goal by this share of it."""
 
 
@@ -43,7 +43,7 @@ class Offers:
         before = situation.goal.left(belief.known[None], margin)[0]
         self.left = situation.goal.left(after[:, :size, :size], margin)
         self.gain = np.where(self.possible, before - self.left, 0.0)
-        self.least = LEAST_GAIN * min(1.0, float(before))
+        self.least = MIN_PLAN_GAIN * min(1.0, float(before))
 
     def hopeless(self, number: int) -> bool:
         """Return whether a motion has almost no gain and does not reach the goal."""
@@ -76,7 +76,7 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
     belief, place, chosen, spent, margin, factor = situation.belief(known), start, [], 0.0, 1.0, 0.0
     taken: list[tuple[np.ndarray, float]] = []
     beginning = situation.goal.left(belief.known[None])[0]
-    while len(chosen) < MOST_MOTIONS and spent < longest:
+    while len(chosen) < MAX_PLAN_MOTIONS and spent < longest:
         if factor != (factor := situation.variance_factor(situation.timed(chosen, start)[0], known)):
             belief = situation.belief(known)
             for information, seconds in taken:
@@ -120,9 +120,9 @@ def exchanged(situation: Situation, sequence: Sequence[int], start: int, *, know
     return best
 
 
-DONE = 'all that was wanted is reached'
+GOAL_REACHED = 'all that was wanted is reached'
 STUCK = 'no motion within the limits reduces the remaining standard deviations'
-WORTH, LEAST_WEIGHT = 1.1, 0.03
+MAX_BOUND_RATIO, MIN_RELATIVE_WEIGHT = 1.1, 0.03
 """A plan this many times longer than the bound is searched again, each parameter with at least this share of the largest weight."""
 
 
@@ -229,7 +229,7 @@ class Planner:
         if self._first is None:
             self._first = [] if self.known is not None else self.situation.first_rests(place)
         if not self._first and not self.situation.goal.left(self._belief.known[None])[0] > 0:
-            return NextMotion(None, STUCK if missing else DONE, missing=missing)
+            return NextMotion(None, STUCK if missing else GOAL_REACHED, missing=missing)
         choice, must = Offers(self.situation, self._belief, place), bool(self._first)
         number = self._first.pop(0) if must else choice.best
         if not must and self._visited and choice.hopeless(number):
@@ -277,8 +277,8 @@ class Planner:
             factor = situation.variance_factor(windows, self.known)
             relaxed = situation.relaxation(self.known, factor=factor)
             bound = situation.lower_bound(self.known, factor=factor, relaxed=relaxed)
-            if seconds > WORTH * bound:   # what limits the relaxed plan counts more: a second attempt
-                weights = np.maximum(relaxed.weights / relaxed.weights.max(), LEAST_WEIGHT)
+            if seconds > MAX_BOUND_RATIO * bound:   # what limits the relaxed plan counts more: a second attempt
+                weights = np.maximum(relaxed.weights / relaxed.weights.max(), MIN_RELATIVE_WEIGHT)
                 situation.goal = WithinTolerances(situation.coordinates, weights)
                 other = self._sequence(place, first, longest)
                 situation.goal = goal
@@ -349,14 +349,14 @@ def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: d
     return planner
 
 
-FORMAT = 'imu_calibration/plan/1'
+PLAN_FORMAT = 'imu_calibration/plan/1'
 
 
 def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
     """Return the content of plan.yaml: plain data in SI, except angles of joints in degrees, named so."""
     begins = np.concatenate([[0.0], plan.ends[:-1]]) if len(plan.ends) else []
     return {
-        'format': FORMAT,
+        'format': PLAN_FORMAT,
         'seconds': round(plan.seconds, 3),
         'lower_bound_seconds': None if np.isnan(plan.lower_bound_seconds) else round(plan.lower_bound_seconds, 3),
         'probability': PROBABILITY,

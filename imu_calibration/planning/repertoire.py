@@ -17,7 +17,7 @@ from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoi
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, Segment
 
-STEP = 0.05
+TRAJECTORY_STEP_SECONDS = 0.05
 """Time between the points of a trajectory, s: quintics between them follow the motion to a micrometre."""
 
 
@@ -94,7 +94,7 @@ def trajectory(joint_names: tuple[str, ...], segments: tuple[Segment, ...]) -> T
     if not segments:
         return TrajectoryPoints.stop(joint_names)
     edges = np.concatenate([[0.0], np.cumsum([segment.duration for segment in segments])])
-    times = np.concatenate([np.linspace(a, b, max(int(np.ceil((b - a) / STEP)), 1) + 1)[1:]
+    times = np.concatenate([np.linspace(a, b, max(int(np.ceil((b - a) / TRAJECTORY_STEP_SECONDS)), 1) + 1)[1:]
                             for a, b in zip(edges, edges[1:], strict=False)])
     motion = motion_at(segments, times)
     rate, acceleration = motion.rate.copy(), motion.acceleration.copy()
@@ -115,9 +115,9 @@ def place_words(names: tuple[str, ...], place: np.ndarray, limits: MotionLimits)
 
 N_TRIED = 512
 """Positions that places are chosen from: a power of two, as the sequence wants it."""
-GRID = np.pi / 4
+POSITION_GRID = np.pi / 4
 """On a table with few joints the positions are multiples of this, so that they include faces, edges and corners."""
-UNBOUNDED = 1e9
+ENDLESS_END = 1e9
 """Finite stand-in for the ends of endless joints, rad."""
 HEADING = 0.4
 """Weight of the horizontal axes relative to the vertical in comparisons of attitudes: headings show the tilt only."""
@@ -126,7 +126,7 @@ HEADING = 0.4
 def reachable(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends within which places are chosen: of joints that turn, at most one turn about the middle of the range."""
     wide = limits.turns & (limits.upper - limits.lower > 2 * np.pi)
-    middle = 0.5 * (np.maximum(limits.lower, -UNBOUNDED) + np.minimum(limits.upper, UNBOUNDED))   # 0 without ends
+    middle = 0.5 * (np.maximum(limits.lower, -ENDLESS_END) + np.minimum(limits.upper, ENDLESS_END))   # 0 without ends
     return np.where(wide, middle - np.pi, limits.lower), np.where(wide, middle + np.pi, limits.upper)
 
 
@@ -150,8 +150,8 @@ def candidates(limits: MotionLimits) -> np.ndarray:
     spread = lower + (upper - lower) * qmc.Sobol(len(limits), seed=5).random(N_TRIED)
     parts = [home[None], spread]
     if len(limits) <= 3:
-        steps = [np.arange(np.ceil(a / GRID - 1e-9), np.floor(b / GRID + 1e-9) + 1) * GRID if turning else np.linspace(a, b, 3)
-                 for a, b, turning in zip(lower, upper, limits.turns, strict=True)]
+        steps = [np.arange(np.ceil(a / POSITION_GRID - 1e-9), np.floor(b / POSITION_GRID + 1e-9) + 1) * POSITION_GRID
+                 if turning else np.linspace(a, b, 3) for a, b, turning in zip(lower, upper, limits.turns, strict=True)]
         grid = np.stack(np.meshgrid(*steps, indexing='ij'), axis=-1).reshape(-1, len(limits))
         parts.insert(1, grid[np.lexsort(np.abs(grid).T)])
     return np.concatenate(parts)
@@ -175,7 +175,7 @@ def choose_places(table: Table, limits: MotionLimits, count: int) -> np.ndarray:
     return tried[chosen]
 
 
-MARGIN = 0.98
+LIMIT_SHARE = 0.98
 """Share of speeds and accelerations that is used, so that splines between the points of a trajectory keep the limits too."""
 DWELLS = (1.8, 2.5, 4.0, 6.5, 10.0, 16.0)
 """Seconds of rest; the first half second settles, and a second is the shortest window."""
@@ -183,11 +183,11 @@ SPIN_TIME = (2.0, 7.0)
 """Seconds for which a constant rate is held at least."""
 SWING_TIME = (4.0, 10.0)
 """Seconds of a swing."""
-FREQUENCIES = (0.35, 1.0)
+SWING_FREQUENCIES = (0.35, 1.0)
 """Swings, Hz."""
 SPEEDS = (1.0, 0.5)
 """Spins, as shares of the largest speed."""
-LARGEST_SWING = {True: 120.0 * DEG, False: 0.3}
+MAX_SWING = {True: 120.0 * DEG, False: 0.3}
 """Amplitude of a swing of a joint that turns, rad, or slides, m, at most."""
 REST_PLACES, SPIN_PLACES, SWING_PLACES, TOGETHER_PLACES = 20, 4, 3, 2
 """Places for rests; for spins and for swings of each joint, and for each set of joints, of a chain with at most three joints."""
@@ -206,7 +206,7 @@ class Repertoire:
 
     def __init__(self, table: Table, limits: MotionLimits):
         self.table = table
-        self.limits = MotionLimits(limits.lower, limits.upper, MARGIN * limits.speed, MARGIN * limits.acceleration, limits.turns)
+        self.limits = MotionLimits(limits.lower, limits.upper, LIMIT_SHARE * limits.speed, LIMIT_SHARE * limits.acceleration, limits.turns)
         self.names = tuple(table.joint_names)
         self.spread = choose_places(table, self.limits, REST_PLACES)
         self.motions = list(self._made())
@@ -243,7 +243,7 @@ class Repertoire:
     def _swings(self):
         for joint in np.flatnonzero(self.limits.upper > self.limits.lower):
             for place in self._subset(SWING_PLACES, int(joint) + 1):
-                for frequency in FREQUENCIES:
+                for frequency in SWING_FREQUENCIES:
                     shares = np.zeros(len(self.names))
                     shares[joint] = 1.0
                     for seconds in SWING_TIME:
@@ -323,7 +323,7 @@ class Repertoire:
         lower, upper = reachable(self.limits)
         room = np.where(self.limits.endless, np.inf, 0.48 * (upper - lower))
         reach = [room / most[0], self.limits.speed / most[1], self.limits.acceleration / most[2],
-                 np.array([LARGEST_SWING[bool(turning)] for turning in self.limits.turns])]
+                 np.array([MAX_SWING[bool(turning)] for turning in self.limits.turns])]
         largest = unit * np.minimum.reduce(reach)
         amplitude = 0.99 * largest   # the largest values are between the instants of `motion`
         middle = np.where(self.limits.endless | (unit == 0), place, 0.5 * (lower + upper))

@@ -14,7 +14,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.window_statistics import BATCH_DOF
 from imu_calibration.planning.belief import (
-    LONGEST,
+    MAX_REACHABLE_SECONDS,
     Belief,
     PlannedWindow,
     Relaxation,
@@ -185,7 +185,7 @@ class Situation:
     def _bias_floor(self, factor: float) -> float:
         """Return the observation time that the biases alone need, s; infinite if they are out of reach."""
         model, coordinates, floor = self.coordinates.model, self.coordinates, 0.0
-        lengths = np.geomspace(0.01, LONGEST, 2000)
+        lengths = np.geomspace(0.01, MAX_REACHABLE_SECONDS, 2000)
         for sensor in SENSORS:
             for k, parameter in enumerate(range(*model.part(sensor, Role.OFFSET).indices(len(model.param_names)))):
                 prior = coordinates.prior_sd[parameter]**2

@@ -14,11 +14,10 @@ from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.preprocessing import value_checks
 from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING, CheckFinding, EvidenceGatherer, RecordingEvidence
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS, long_runs
-from imu_calibration.preprocessing.stamping import IRREGULAR
-from imu_calibration.preprocessing.stream_cleaning import MESSAGES as NAMES
-from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, CleanedBlock, StreamStatistics
+from imu_calibration.preprocessing.stamping import IRREGULAR, MAX_IRREGULAR_SHARE
+from imu_calibration.preprocessing.stream_cleaning import MESSAGES, BlockCleaner, CleanedBlock, StreamStatistics
 
-MOVING = 50.0
+MIN_MOVING_STEPS = 50.0
 """A constant axis is frozen if another axis moves by this many steps of the converter."""
 
 
@@ -41,7 +40,7 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                                    f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the remaining axes do; '
                               'check the sensor and its driver')
         for axis in np.flatnonzero(~constant):
-            moving = np.delete(range_[:, part], axis, axis=1) > MOVING * np.delete(evidence.resolution[part], axis)
+            moving = np.delete(range_[:, part], axis, axis=1) > MIN_MOVING_STEPS * np.delete(evidence.resolution[part], axis)
             same = (range_[:, part][:, axis] == 0) & ~_at_end(chunks.mean[:, part][:, axis], evidence.ends[part][axis])
             stuck = _in_long_runs(same & moving.any(axis=1)) if noisy[axis] else np.zeros(1, bool)
             if stuck.any():
@@ -86,7 +85,7 @@ def _spans(parts):
     return ', '.join(words) + (f' and {len(parts) - 3} times more' if len(parts) > 3 else '')
 
 
-FAST = ('imu', 'joints')
+FAST_STREAMS = ('imu', 'joints')
 WHOLE_MS = 1_000_000
 ADVICE = {
     'not finite': 'the driver sends them; they are left out',
@@ -100,7 +99,6 @@ SPIKE_SHARE = 5e-3
 """Occasional knocks resemble spikes, and 1 % of spikes do not degrade a calibration; a larger share has a cause."""
 GAP_SHARE = 0.01
 RATE_SHARE = 0.02
-IRREGULAR_SHARE = 0.05
 
 
 def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -113,18 +111,18 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         if found.count < 0.1 * total:
             reasons = ', '.join(f'{count} {reason}' for reason, count in found.dropped.items())
             yield CheckFinding('stamps', REFUSE,
-                               f'{NAMES[name]} must hold finite samples whose header stamps advance, of {total} only {found.count} do '
+                               f'{MESSAGES[name]} must hold finite samples whose header stamps advance, of {total} only {found.count} do '
                           f'({reasons}); correct the driver and record again')
             continue
         if found.unstamped:
             yield CheckFinding('stamps', WARNING,
-                               f'{NAMES[name]}: {found.unstamped} of {total} stamps are zero: the time of arrival '
+                               f'{MESSAGES[name]}: {found.unstamped} of {total} stamps are zero: the time of arrival '
                                'is used; the driver should stamp each sample at its measurement')
         for reason, count in found.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
-            yield CheckFinding('stamps', severity, f'{NAMES[name]}: {count} of {total} samples {_phrase(reason)}: {ADVICE[reason]}'
-                          if reason != 'clock reset' else f'{NAMES[name]}: the stamps jump {_times(count)}: {ADVICE[reason]}')
-        clean += [] if found.dropped else [NAMES[name]]
+            yield CheckFinding('stamps', severity, f'{MESSAGES[name]}: {count} of {total} samples {_phrase(reason)}: {ADVICE[reason]}'
+                          if reason != 'clock reset' else f'{MESSAGES[name]}: the stamps jump {_times(count)}: {ADVICE[reason]}')
+        clean += [] if found.dropped else [MESSAGES[name]]
     if clean:
         yield CheckFinding('stamps', GOOD, f'{" and ".join(clean)}: all stamps advance')
 
@@ -140,50 +138,50 @@ def _times(count):
 
 def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The streams have no gaps."""
-    for name in FAST:
+    for name in FAST_STREAMS:
         if name in evidence.streams:
             found = evidence.streams[name].statistics
             if found.n_gaps:
                 severity = WARNING if found.gap_total > GAP_SHARE * found.duration else NOTE
                 yield CheckFinding('gaps', severity,
-                                   f'{NAMES[name]}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, '
+                                   f'{MESSAGES[name]}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, '
                                    f'{found.gap_total:.2f} s of {found.duration:.0f} s, '
                               f'the longest {found.longest_step:.2f} s; motion within a gap is not used')
 
 
 def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The samples per second agree with the step between stamps."""
-    for name in FAST:
+    for name in FAST_STREAMS:
         if name in evidence.streams:
             stream = evidence.streams[name]
             nominal, real = stream.statistics.rate, stream.real_rate
             if nominal and abs(real / nominal - 1) > RATE_SHARE:
                 yield CheckFinding('sampling', WARNING,
-                                   f'{NAMES[name]}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is {real:.2f} Hz: '
+                                   f'{MESSAGES[name]}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is {real:.2f} Hz'
                               'samples were lost, or stamps are made when messages arrive; '
                               'check the driver and the load of the recorder')
             elif nominal:
-                yield CheckFinding('sampling', GOOD, f'{NAMES[name]}: {real:.2f} Hz, as the steps between stamps promise')
+                yield CheckFinding('sampling', GOOD, f'{MESSAGES[name]}: {real:.2f} Hz, as the steps between stamps promise')
 
 
 def jitter(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Samples are evenly spaced, and stamps finer than their spacing."""
-    for name in FAST:
+    for name in FAST_STREAMS:
         if name in evidence.streams:
             stream = evidence.streams[name]
             if (line := stream.statistics.stamping) is not None:
                 yield CheckFinding('jitter', WARNING if line.word == IRREGULAR else NOTE,
-                                   f"{NAMES[name]}: {line}; stamps by the sensor's own clock "
+                                   f"{MESSAGES[name]}: {line}; stamps by the sensor's own clock "
                                    'would be better')
             period, step_ns = stream.statistics.period, stream.statistics.stamp_step_ns
             whole_ms = bool(step_ns) and step_ns % WHOLE_MS == 0 and step_ns < 0.5e9 * period
-            if not whole_ms and stream.irregular <= IRREGULAR_SHARE:
+            if not whole_ms and stream.irregular <= MAX_IRREGULAR_SHARE:
                 continue
             came = f'all stamps are multiples of {step_ns // WHOLE_MS} ms' if whole_ms else ''
-            if stream.irregular > IRREGULAR_SHARE:
+            if stream.irregular > MAX_IRREGULAR_SHARE:
                 off = f'{100 * stream.irregular:.0f} % of the steps are off the usual {period * 1e3:.4g} ms by more than a tenth'
                 came = f'{came}, {off}' if came else off
-            yield CheckFinding('jitter', NOTE, f"{NAMES[name]}: {came}; stamps by the sensor's own clock would be better")
+            yield CheckFinding('jitter', NOTE, f"{MESSAGES[name]}: {came}; stamps by the sensor's own clock would be better")
 
 
 def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.preprocessing.scan import Chunks, Rest
 
-FAR = 0.25
+MIN_MISSED_ANGLE = 0.25
 """
 Rms angle by which gravity misses the direction after a turn, rad, above which factors are tested: scale errors of a tenth cause less.
 """
-BETTER = 0.3
+MAX_ANGLE_SHARE = 0.3
 """A factor is accepted when the remaining angle is below this share of the angle without it."""
 FACTORS = 2.0 ** np.arange(-4.0, 4.01, 0.25)
 """
@@ -24,7 +24,7 @@ NEAR_POWER = 0.15
 LEAST_TURNS, MOST_TURNS = 3, 16
 LEAST_ANGLE = 0.3
 """Least turn of gravity for a test of factors, rad."""
-LONGEST = 30.0
+MAX_TURN_SECONDS = 30.0
 """s; the gyroscope's wander adds up in longer turns."""
 
 
@@ -39,11 +39,11 @@ def believed_factor(missed: Callable[[float], float]) -> float:
 
     """
     as_it_is = missed(1.0)
-    if as_it_is < FAR:
+    if as_it_is < MIN_MISSED_ANGLE:
         return 1.0
     angles = [missed(factor) for factor in FACTORS]
     best = int(np.argmin(angles))
-    return nearest_power(FACTORS[best]) if angles[best] < BETTER * as_it_is else 1.0
+    return nearest_power(FACTORS[best]) if angles[best] < MAX_ANGLE_SHARE * as_it_is else 1.0
 
 
 def nearest_power(factor: float) -> float:
@@ -67,7 +67,7 @@ def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
     for first, ((_, start), (stop, _)) in enumerate(zip(rest.ranges, rest.ranges[1:])):
         span = chunks.time[stop] - chunks.time[start - 1]
         unbroken = whole[start:stop].all() and span < 1.5 * np.median(chunks.duration) * (stop - start + 1)
-        if stop > start and unbroken and span < LONGEST and up[first] @ up[first + 1] < np.cos(LEAST_ANGLE):
+        if stop > start and unbroken and span < MAX_TURN_SECONDS and up[first] @ up[first + 1] < np.cos(LEAST_ANGLE):
             turns.append(((chunks.mean[start:stop, 3:] - rest.rate) * chunks.duration[start:stop, None], up[first], up[first + 1]))
     if len(turns) < LEAST_TURNS:
         return None
@@ -82,12 +82,12 @@ def _missed(vectors, before, after):
     return np.arccos(np.clip(turned @ after, -1.0, 1.0))
 
 
-KEPT = 24
+COUNTED_OUTPUTS = 24
 """Different outputs below the largest that are counted."""
-NEAR = 0.9
+NEAR_LARGEST_SHARE = 0.9
 """Outputs above this share of the largest are evaluated."""
-CANDIDATES = 400
-LEAST_CLIPPED = 4
+MAX_NEAR_OUTPUTS = 400
+MIN_CLIPPED_SAMPLES = 4
 JUMP = 0.01
 """A step to the largest value by more than this share of it is not noise."""
 PILE = 5.0
@@ -105,36 +105,36 @@ class Extremes:
         """Process values, shape (n,)."""
         before, self._last = self._last, values[-1]
         largest = values.max()
-        if largest <= 0 or largest < NEAR * self.level:
+        if largest <= 0 or largest < NEAR_LARGEST_SHARE * self.level:
             return
         if largest > self.level:
             if np.isfinite(self.level):
                 self._below[self.level] = self.count
             self.level, self.count, self.n_jumps = float(largest), 0, 0
-        near = values[values > NEAR * self.level]
+        near = values[values > NEAR_LARGEST_SHARE * self.level]
         below = near < self.level
         self.count += len(near) - int(np.count_nonzero(below))
         near = near[below]
         if largest == self.level:
             at = np.flatnonzero(values == largest)
             self.n_jumps += int(np.count_nonzero(np.where(at > 0, values[at - 1], before) < (1 - JUMP) * largest))
-        if len(near) > CANDIDATES:
-            near = np.partition(near, len(near) - CANDIDATES)[-CANDIDATES:]
+        if len(near) > MAX_NEAR_OUTPUTS:
+            near = np.partition(near, len(near) - MAX_NEAR_OUTPUTS)[-MAX_NEAR_OUTPUTS:]
         for value, count in zip(*np.unique(near, return_counts=True)):
             self._below[float(value)] = self._below.get(float(value), 0) + int(count)
-        self._below = dict(sorted(self._below.items(), reverse=True)[:KEPT])
+        self._below = dict(sorted(self._below.items(), reverse=True)[:COUNTED_OUTPUTS])
 
     @property
     def jumped(self) -> bool:
         """Whether the largest value was often reached by a large step, which does not occur with rounded readings of a constant."""
-        return self.n_jumps >= LEAST_CLIPPED
+        return self.n_jumps >= MIN_CLIPPED_SAMPLES
 
     @property
     def n_clipped(self) -> int:
         """Samples at the largest value if their number is far above that of neighbouring values, else 0."""
-        counts = [count for value, count in self._below.items() if value > NEAR * self.level][:10]
+        counts = [count for value, count in self._below.items() if value > NEAR_LARGEST_SHARE * self.level][:10]
         usual = sum(counts) / len(counts) if counts else 1.0
-        return self.count if self.count >= max(LEAST_CLIPPED, PILE * usual) else 0
+        return self.count if self.count >= max(MIN_CLIPPED_SAMPLES, PILE * usual) else 0
 
 
 LARGEST_TURN = 0.7
@@ -144,7 +144,7 @@ FORCE_BAND = 0.2
 LEAST_TURN = 1.0
 """Gravity must turn by this much altogether, rad."""
 LEAST_EXPLAINED = 0.5
-WIDTH = 4.0
+CHUNK_SD_FACTOR = 4.0
 """Factor on standard deviations for the correlation of errors of neighbouring chunks."""
 DETERMINED_SD_SHARE = 0.15
 """A direction is determined when the standard deviation of its column is below this share of its length."""
@@ -219,7 +219,7 @@ def _fit(direction, change, turn_time, rate):
     inverse = np.linalg.pinv(normal + 1e-9 * np.trace(normal) * np.eye(3 * width))
     solution = inverse @ (design.T @ target)
     rest = float(((target - design @ solution)**2).sum())
-    sd = WIDTH * np.sqrt(np.diag(inverse) * rest / max(len(target) - 3 * width, 1)).reshape(3, width)[:, :-1]
+    sd = CHUNK_SD_FACTOR * np.sqrt(np.diag(inverse) * rest / max(len(target) - 3 * width, 1)).reshape(3, width)[:, :-1]
     matrix = solution.reshape(3, width)[:, :-1]
     return matrix, np.linalg.norm(sd, axis=0) < DETERMINED_SD_SHARE * np.linalg.norm(matrix, axis=0), 1.0 - rest / float((target**2).sum())
 

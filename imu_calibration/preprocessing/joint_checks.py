@@ -12,17 +12,17 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import refuse
-from imu_calibration.preprocessing.on_table import CLEAR, exchanged, find_exchange, match_axes, same_motion, signs_or_delay
+from imu_calibration.preprocessing.on_table import MIN_MATCH, TESTED_RATE, exchanged, find_exchange, match_axes, same_motion, signs_or_delay
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
-from imu_calibration.preprocessing.scan import TURNS
+from imu_calibration.preprocessing.scan import MIN_TURN_RATE
 from imu_calibration.preprocessing.value_checks import force_error
 from imu_calibration.preprocessing.window import Window
 
 LASTING = 1.0
 """Least duration of a standstill, s; shorter ones are handled by other checks."""
-STILL = 1e-6
+MAX_REPEATED_RATE = 1e-6
 """Largest rate of a joint with a repeated state after smoothing of the positions, rad/s."""
-ALONG = 0.8
+FROZEN_SHARE = 0.8
 """Share of the unexplained rate that lies along the axis of a joint that is frozen, as a mean square."""
 OWN = 0.3
 """The unexplained rate along that axis is at least this share of the measured rate along it: a wrong gain causes less."""
@@ -48,7 +48,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     if not windows:
         return None
     expected = [reference_motion(table, window.motion).rate_s for window in windows]
-    turning = [np.linalg.norm(rate, axis=1) > TURNS for rate in expected]
+    turning = [np.linalg.norm(rate, axis=1) > MIN_TURN_RATE for rate in expected]
     repeats = [np.diff(window.rate_s, axis=0) == 0 for window in windows]
     same = [np.append(each.all(axis=1), False) for each in repeats]
     bias = np.median(np.concatenate([window.rate_s - rate for window, rate in zip(windows, expected)]), axis=0)
@@ -75,7 +75,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
 
 def _frozen(window, table, expected, *, joint):
     """Yield (start, stop) in which a joint's state is constant while the residual rate is along its axis."""
-    for start, stop in _runs(np.abs(window.motion.rate[:, joint]) < STILL):
+    for start, stop in _runs(np.abs(window.motion.rate[:, joint]) < MAX_REPEATED_RATE):
         if window.time[stop - 1] - window.time[start] < LASTING:
             continue
         motion, rest = window.motion.select(slice(start, stop)), (window.rate_s - expected)[start:stop]
@@ -84,7 +84,7 @@ def _frozen(window, table, expected, *, joint):
         axis = reference_motion(table, replace(motion, rate=faster)).rate_s - reference_motion(table, motion).rate_s
         along, measured = (rest * axis).sum(axis=1), (window.rate_s[start:stop] * axis).sum(axis=1)
         square = float(along @ along)
-        if square > len(along) * TURNS**2 and square > ALONG * (rest**2).sum() and square > OWN**2 * (measured @ measured):
+        if square > len(along) * MIN_TURN_RATE**2 and square > FROZEN_SHARE * (rest**2).sum() and square > OWN**2 * (measured @ measured):
             yield float(window.time[start]), float(window.time[stop - 1])
 
 
@@ -119,8 +119,6 @@ LEAST_POWER_SHARE = {'accelerometer': 0.03, 'gyroscope': 0.01}
 """Directions in which the reference has less than this share of its largest power are not used."""
 RELATED = 0.5
 """Smallest squared correlation for a check of factors and axes."""
-LEAST_RATE = 0.02
-"""Least rms of the reference's rates for a check, rad/s."""
 WORDS = {'accelerometer': ('specific force at rest', 'gravity in the attitudes of the joints'),
          'gyroscope': ('angular rates', 'the rates of the joints')}
 
@@ -176,7 +174,7 @@ def _moments(accumulator, model, sensor):
             total = total + factor.T @ factor
     if sensor == 'gyroscope':
         samples = sum(accumulator.samples.values())
-        if np.trace(total[part, part]) < LEAST_RATE**2 * max(samples, 1):
+        if np.trace(total[part, part]) < TESTED_RATE**2 * max(samples, 1):
             return None
     return total[-3:, part], total[part, part], total[-3:, -3:]
 
@@ -243,7 +241,7 @@ def _axes(sensor, moments, table, windows):
 
 def _exchange(match, seen):
     known = [f"measured {'xyz'[i]} is {'minus ' if sign < 0 else ''}the reference's {'xyz'[j]}" for i, j, sign in match.exchanges(seen)]
-    return ', '.join(known) if known and match.agreement > CLEAR else 'no exchange of axes makes them so'
+    return ', '.join(known) if known and match.agreement > MIN_MATCH else 'no exchange of axes makes them so'
 
 
 def _cause(match, matrix, seen, table):

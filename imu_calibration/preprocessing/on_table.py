@@ -13,11 +13,11 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
 from imu_calibration.preprocessing.window import Window
 
-CLEAR = 0.8
+MIN_MATCH = 0.8
 """Agreement from which on an exchange of axes describes the matrix."""
 POOR = 0.6
 """Agreement of the axes as they are below which they are wrong; a turn by 60 degrees has 0.67."""
-TIE = 0.05
+AGREEMENT_TIE = 0.05
 
 
 def signed_permutations() -> np.ndarray:
@@ -74,7 +74,7 @@ def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:
     candidates = signed_permutations()
     scores = np.einsum('kij,ij->k', candidates, inside) / (scale * np.trace(seen))
     best = scores.max()
-    near = scores >= best - TIE
+    near = scores >= best - AGREEMENT_TIE
     proper = np.linalg.det(candidates) > 0
     return AxisMatch(candidates[np.argmax(near)], float(best), float(scores[0]), bool((near & proper).any()), bool((near & ~proper).any()))
 
@@ -83,13 +83,13 @@ SAME = 0.5
 """Smallest share of the measured rates that the reference explains on the same table, as a squared correlation."""
 LEAST_SHARE_EXPLAINED = 0.8
 """Smallest share explained of an exchange that is reported."""
-PIECE = 5.0
+TESTED_PIECE_SECONDS = 5.0
 """Duration of the pieces of a recording that are tested separately, s."""
-LEAST_RATE = 0.02
-"""Smallest rms rate of such a piece, rad/s."""
-LEAST_SAMPLES, MOST_SAMPLES = 20, 5_000
+TESTED_RATE = 0.02
+"""Smallest rms rate for a test, rad/s."""
+MIN_TESTED_SAMPLES, MAX_TESTED_SAMPLES = 20, 5_000
 """Samples that are tested."""
-MOST_JOINTS = 3
+MAX_PERMUTED_JOINTS = 3
 """All orders and signs are tested up to this number of joints; above it, each sign and each exchange of two joints."""
 
 
@@ -122,20 +122,20 @@ def find_exchange(windows: Sequence[Window], table: Table) -> Exchange | None:
     table : Table
 
     """
-    windows = [window for window in windows if len(window) >= LEAST_SAMPLES and len(window.motion) == len(window)]
+    windows = [window for window in windows if len(window) >= MIN_TESTED_SAMPLES and len(window.motion) == len(window)]
     if not windows:
         return None
     time = np.concatenate([window.time for window in windows])
-    every = slice(None, None, max(1, len(time) // MOST_SAMPLES))
+    every = slice(None, None, max(1, len(time) // MAX_TESTED_SAMPLES))
     time, motion = time[every], JointMotion.joined([window.motion for window in windows]).select(every)
     measured = np.concatenate([np.hstack([window.rate_s, window.force_s]) for window in windows])[every]
     rate = measured[:, :3] = measured[:, :3] - np.median(measured[:, :3], axis=0)
     squares = np.stack([((rate - reference_motion(table, motion).rate_s)**2).sum(axis=1), (rate**2).sum(axis=1), np.ones(len(time))])
-    piece = ((time - time.min()) / PIECE).astype(int)
+    piece = ((time - time.min()) / TESTED_PIECE_SECONDS).astype(int)
     residual, power, count = np.array([np.bincount(piece, weights=each) for each in squares])
-    tested = power > LEAST_RATE**2 * count
+    tested = power > TESTED_RATE**2 * count
     part = (tested & (residual > (1.0 - SAME) * power))[piece]
-    if part.sum() < LEAST_SAMPLES:
+    if part.sum() < MIN_TESTED_SAMPLES:
         return None
     for chosen, span in ((tested[piece], None), (part, (float(time[part].min()), float(time[part].max())))):
         (order, signs), axes, instead, share = _best(measured[chosen], motion.select(chosen), table)
@@ -155,8 +155,8 @@ def _best(measured, motion, table):
         for row, known, expected in zip(shares, (measured[:, :3], measured[:, 3:]), (reference.rate_s, reference.force_s)):
             cross = np.einsum('pij,ij->p', axes, known.T @ expected)
             row[k] = (2.0 * cross - (expected**2).sum()) / max((known**2).sum(), 1e-300)
-    near = shares[0] >= shares[0].max() - TIE
-    near &= shares[1] >= shares[1][near].max() - TIE
+    near = shares[0] >= shares[0].max() - AGREEMENT_TIE
+    near &= shares[1] >= shares[1][near].max() - AGREEMENT_TIE
     joint_changes = [np.count_nonzero((np.array(order) != range(len(order))) | (np.array(signs) < 0)) for order, signs in candidates]
     axis_changes = (axes != np.eye(3)).any(axis=2).sum(axis=1)
     changes = np.add.outer(joint_changes, axis_changes) + np.logical_and.outer(joint_changes, axis_changes)
@@ -167,7 +167,7 @@ def _best(measured, motion, table):
 def _candidates(n_joints):
     """Return (index of the joint with the readings of each joint, signs) of the candidates, the description itself first."""
     identity, plus = list(range(n_joints)), [1.0] * n_joints
-    if n_joints <= MOST_JOINTS:
+    if n_joints <= MAX_PERMUTED_JOINTS:
         return [(list(order), list(signs)) for order in permutations(identity) for signs in product((1.0, -1.0), repeat=n_joints)]
     reversed_joints = [(identity, [-1.0 if k == j else 1.0 for k in identity]) for j in identity]
     return [(identity, plus), *reversed_joints,
@@ -185,13 +185,13 @@ def _axis_phrases(axes):
                  for i, j in enumerate(where) if i != j or axes[i, j] < 0)
 
 
-TURNS = 0.05
+MIN_RATE_GAIN = 0.05
 """Smallest gain of the measured rates with respect to the rates of the table for an IMU on the table."""
 LARGEST_SHIFT = 5.0
 """Largest delay between the streams that is tested, s."""
 LEAST_SHIFT = 0.05
 """Smaller delays are estimated as a lag, s."""
-ALIKE = 0.02
+SHARE_TIE = 0.02
 """Shares explained that differ by less do not separate a delay from a wrong sign or from a lag."""
 RESOLVED = 4
 """Shifts that are tested per sampling period: the rates of fast sweeps differ within one period."""
@@ -216,12 +216,12 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
     matrix = cross @ np.linalg.pinv(reference, rcond=0.01)
     gain = np.sqrt(np.trace(matrix @ reference @ matrix.T) / np.trace(reference))
     explained = np.trace(matrix @ reference @ matrix.T) / max(np.trace(measured), 1e-300)
-    if explained >= SAME and gain > 0.1 * TURNS:   # other checks report units, signs and axes
-        return _a_period_late(windows, table) if table is not None and explained < 1.0 - ALIKE else None
+    if explained >= SAME and gain > 0.1 * MIN_RATE_GAIN:   # other checks report units, signs and axes
+        return _a_period_late(windows, table) if table is not None and explained < 1.0 - SHARE_TIE else None
     key, cause = 'imu_topic', 'this IMU does not turn when the table does; give the topic of the IMU on the table'
-    if np.trace(measured) > TURNS * np.trace(reference):
+    if np.trace(measured) > MIN_RATE_GAIN * np.trace(reference):
         cause, key = (_cause(windows, table) if table is not None else ''), None
-    elif gain > TURNS:
+    elif gain > MIN_RATE_GAIN:
         return None
     if not cause:
         key, cause = 'imu_topic', ('its motion is not that of the table; give the topic of the IMU on the table, and check '
@@ -233,8 +233,8 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
 def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckFinding | None:
     """Return the finding of joints or IMU axes that are exchanged or reversed, or None if a delay explains the rates better."""
     shift = _best_shift(windows, table)
-    late = abs(shift.seconds) > LEAST_SHIFT and shift.share > exchange.share - ALIKE
-    if late and shift.share > exchange.share + ALIKE:
+    late = abs(shift.seconds) > LEAST_SHIFT and shift.share > exchange.share - SHARE_TIE
+    if late and shift.share > exchange.share + SHARE_TIE:
         return None
     phrases = ', '.join(exchange.joints + exchange.axes) + (f' (or {", ".join(exchange.instead)})' if exchange.instead else '')
     span = '' if exchange.span is None else ' from {:.0f} s to {:.0f} s'.format(*exchange.span)
@@ -248,7 +248,7 @@ def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckF
 def _cause(windows, table):
     """Return the delay with which the streams agree, or ''."""
     shift = _best_shift(windows, table)
-    late = abs(shift.seconds) > LEAST_SHIFT and shift.share > max(SAME, shift.unshifted + ALIKE)
+    late = abs(shift.seconds) > LEAST_SHIFT and shift.share > max(SAME, shift.unshifted + SHARE_TIE)
     return _late(shift.seconds) if late else ''
 
 
@@ -256,7 +256,7 @@ def _a_period_late(windows, table):
     """Return the finding for streams of a repeating motion that agree clearly better a period earlier or later, or None."""
     shift, share, unshifted, ambiguous = _best_shift(windows, table)
     # opposite rates: a wrong sign, or half a period
-    if ambiguous or abs(shift) <= LEAST_SHIFT or unshifted < 0 or share < max(LEAST_SHARE_EXPLAINED, unshifted + ALIKE):
+    if ambiguous or abs(shift) <= LEAST_SHIFT or unshifted < 0 or share < max(LEAST_SHARE_EXPLAINED, unshifted + SHARE_TIE):
         return None
     return CheckFinding('on_table', REFUSE, 'both streams must share one clock, '
                         f'the joints explain {100 * unshifted:.0f} % of the rates with a delay up to {LEAST_SHIFT} s '
@@ -289,7 +289,7 @@ class Delay:
     words: str
     """Cause and remedy."""
     sure: bool
-    """Whether it explains more of the rates than a wrong sign, by more than ALIKE."""
+    """Whether it explains more of the rates than a wrong sign, by more than SHARE_TIE."""
 
 
 def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
@@ -306,9 +306,9 @@ def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
 
     """
     shift, share, unshifted, _ = _best_shift(windows, table)
-    if abs(shift) <= LEAST_SHIFT or share < SAME or share < -unshifted - ALIKE:
+    if abs(shift) <= LEAST_SHIFT or share < SAME or share < -unshifted - SHARE_TIE:
         return None
-    return Delay(_late(shift), share > -unshifted + ALIKE)
+    return Delay(_late(shift), share > -unshifted + SHARE_TIE)
 
 
 def _best_shift(windows, table):
@@ -317,7 +317,7 @@ def _best_shift(windows, table):
 
     ``share(s) = c |c| / (e_m e_r)`` with c the sum of measured(t) reference(t - s) and e their sums of squares, all of the same pairs.
     """
-    windows = [window for window in windows if len(window) >= LEAST_SAMPLES]
+    windows = [window for window in windows if len(window) >= MIN_TESTED_SAMPLES]
     if not windows:
         return _Shift(0.0, 0.0, 0.0, False)
     period = float(np.median([window.period for window in windows]))
@@ -343,7 +343,7 @@ def _best_shift(windows, table):
     place = int(np.argmax(near)) + middle - lag
     best = _nearest_peak(shares, middle)
     other = shares[middle + lag + 1:] if best < middle else shares[:max(middle - lag, 0)]
-    twin = 0 < place - middle + lag < 2 * lag and shares[best] < 1.0 - ALIKE and other.max(initial=-1.0) > shares[best] - ALIKE
+    twin = 0 < place - middle + lag < 2 * lag and shares[best] < 1.0 - SHARE_TIE and other.max(initial=-1.0) > shares[best] - SHARE_TIE
     return _Shift((best - middle) * period / RESOLVED, float(shares[best]), float(shares[place]), bool(twin))
 
 
@@ -357,7 +357,7 @@ def _correlations(first, second, most):
 
 
 def _nearest_peak(shares, middle):
-    """Return the index of the peak nearest to zero delay among peaks within ALIKE of the highest: periodic motion has many."""
+    """Return the index of the peak nearest to zero delay among peaks within SHARE_TIE of the highest: periodic motion has many."""
     inner = shares[1:-1]
-    peaks = 1 + np.flatnonzero((inner >= shares[:-2]) & (inner >= shares[2:]) & (inner >= shares.max() - ALIKE))
+    peaks = 1 + np.flatnonzero((inner >= shares[:-2]) & (inner >= shares[2:]) & (inner >= shares.max() - SHARE_TIE))
     return int(peaks[np.argmin(np.abs(peaks - middle))]) if len(peaks) else int(np.argmax(shares))

@@ -23,7 +23,7 @@ from imu_calibration.preprocessing.scan import (
 )
 from imu_calibration.preprocessing.stream_cleaning import STREAMS, CleanedBlock, StreamStatistics
 
-IRREGULAR = 0.1
+MAX_STEP_DEVIATION = 0.1
 """Steps farther than this share from the usual one count as irregular."""
 RESOLUTION_SAMPLES = 20_000
 """First samples, from which the smallest step between readings is estimated."""
@@ -186,7 +186,7 @@ class _Steps:
         if self._period_ns is None:
             self._period_ns = float(np.median(step[:2000]))
         self._n_steps += len(step)
-        self._n_irregular += int(np.count_nonzero(np.abs(step - self._period_ns) > IRREGULAR * self._period_ns))
+        self._n_irregular += int(np.count_nonzero(np.abs(step - self._period_ns) > MAX_STEP_DEVIATION * self._period_ns))
 
     def summary(self):
         """Return (first stamp, last stamp, share of irregular steps)."""
@@ -235,9 +235,9 @@ class CheckFinding:
 
 OLD = 0.5
 """s; transforms and filters drop older messages, and the delay of a driver is much smaller."""
-ABSENT = -1.0
+ABSENT_MARK = -1.0
 """First element of a covariance: the message does not have that quantity (sensor_msgs/Imu)."""
-QUANTITIES = ('specific force', 'angular rate', 'orientation')
+MESSAGE_QUANTITIES = ('specific force', 'angular rate', 'orientation')
 SYMMETRY = 1e-6
 """Share of the largest variance; rounding errors are much smaller."""
 
@@ -280,7 +280,7 @@ def frame(evidence: MessageEvidence) -> Iterator[CheckFinding]:
 def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
     """Covariances are unknown (zeros), absent (-1) or covariances: finite, symmetric, not negative."""
     for name, matrix in evidence.covariances.items():
-        if matrix[0, 0] == ABSENT:
+        if matrix[0, 0] == ABSENT_MARK:
             if name != 'orientation':
                 yield CheckFinding('covariance', NOTE, f'the covariance marks the {name} in these messages as absent (-1)')
             continue
@@ -304,7 +304,7 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
 def orientation(evidence: MessageEvidence) -> Iterator[CheckFinding]:
     """An orientation is a unit quaternion, or marked as absent."""
     given = evidence.covariances.get('orientation')
-    if evidence.orientation is None or given is None or given[0, 0] == ABSENT:
+    if evidence.orientation is None or given is None or given[0, 0] == ABSENT_MARK:
         return
     size = float(np.linalg.norm(evidence.orientation))
     if not abs(size - 1) < 0.01:

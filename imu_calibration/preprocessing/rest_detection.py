@@ -11,13 +11,13 @@ from imu_calibration.preprocessing.window import WindowSettings
 
 SPANS = (0.25, 1.0)
 """Variances are computed over these times, s: the short one detects a knock, the long one a slow swing."""
-REACH = 1.3
+QUIETNESS_REACH = 1.3
 """Samples at a larger distance do not change quietness, s."""
 BELOW = 0.1
 """Vibration is the part removed by three running means over this time, s: above about 8 Hz."""
-STEADY = 0.75
+STEADY_SECONDS = 0.75
 """Vibration is steady when it is not above the quiet ratio of its minimum within this time on both sides, s; a knock is not steady."""
-_LEAST_SAMPLES = 10
+_MIN_QUIET_SAMPLES = 10
 _GRID = 0.01  # s: spans begin and end on this grid, or at every sample of a slow IMU
 _GROWTH = 2.0
 _GUARD = 0.05  # s kept out on both sides of a disturbance, whose first samples can hide in a quiet span
@@ -79,10 +79,10 @@ def _steady(force_s, rate_s, period, *, ratio, resting):
     """Return a mask of the samples in a short span at rest whose variance is about the minimum of the spans around."""
     cell = max(1, min(int(_GRID / period), len(force_s)))
     edges = np.append(np.arange(0, len(force_s) - cell + 1, cell), len(force_s))
-    width = min(max(int(np.ceil(_LEAST_SAMPLES / cell)), int(round(SPANS[0] / period / cell))), len(edges) - 1)
+    width = min(max(int(np.ceil(_MIN_QUIET_SAMPLES / cell)), int(round(SPANS[0] / period / cell))), len(edges) - 1)
     variance = np.stack([_CellSums(values, edges).variance(width) for values in (force_s, rate_s)])
     at_rest = _free_of(~np.logical_and.reduceat(resting, edges[:-1]), width)
-    around = 2 * int(round(STEADY / period / cell)) + 1
+    around = 2 * int(round(STEADY_SECONDS / period / cell)) + 1
     least = minimum_filter1d(np.where(at_rest, variance, np.inf), around, axis=1, mode='nearest')
     floor = np.maximum(least, [[least_variance(force_s)], [least_variance(rate_s)]])
     steady = _covered(at_rest & np.all(variance <= ratio**2 * floor, axis=0), width)
@@ -127,7 +127,7 @@ def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, rat
     at_rest = None if resting is None else np.logical_and.reduceat(resting, edges[:-1])
     quiet, shorter = np.ones(len(edges) - 1, bool), np.full(2, np.inf)
     for span in spans:
-        width = min(max(int(np.ceil(_LEAST_SAMPLES / cell)), int(round(min(span, longest) / period / cell))), len(quiet))
+        width = min(max(int(np.ceil(_MIN_QUIET_SAMPLES / cell)), int(round(min(span, longest) / period / cell))), len(quiet))
         variance = np.stack([item.variance(width) for item in sums], axis=1)
         limit = floor.update(span, _chunk_floor(variance, width, at_rest))
         if limit is None and np.isinf(shorter).all():

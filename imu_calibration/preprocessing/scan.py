@@ -6,13 +6,13 @@ import numpy as np
 
 from imu_calibration.core.samples import runs_of
 
-CHUNK_TIME = 0.25
-"""s; short against turns by hand, long against the period of the samples."""
-LEAST, MOST = 8, 2048
+CHUNK_SECONDS = 0.25
+"""s; short against turns by hand, long against the period of the samples; also the distance at which temperatures are kept."""
+MIN_CHUNK_SAMPLES, MAX_CHUNK_SAMPLES = 8, 2048
 """Samples per chunk."""
 FIRST = 200
 """Samples from which the period is estimated."""
-CAPACITY = 40_000
+MAX_SCAN_CHUNKS = 40_000
 """Chunks kept, nearly three hours; later samples are counted but not checked."""
 
 
@@ -56,7 +56,7 @@ class ChunkSeries:
 
     """
 
-    def __init__(self, chunk_time: float = CHUNK_TIME, capacity: int = CAPACITY):
+    def __init__(self, chunk_time: float = CHUNK_SECONDS, capacity: int = MAX_SCAN_CHUNKS):
         self.size, self._chunk_time, self._capacity = None, chunk_time, capacity
         self.n_samples = 0
         self.n_changed = np.zeros(6, np.int64)
@@ -78,12 +78,12 @@ class ChunkSeries:
 
     def chunks(self) -> Chunks:
         """Return the Chunks until now."""
-        if self.size is None and self._rest is not None and len(self._rest[0]) > LEAST:
+        if self.size is None and self._rest is not None and len(self._rest[0]) > MIN_CHUNK_SAMPLES:
             self.size = _size(self._rest[0], self._chunk_time)
             self._cut()
         parts = self._parts or [(np.zeros(0), np.zeros(0), *(np.zeros((0, 6)) for _ in range(3)))]
         time, duration, mean, sd, extent = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return Chunks(time, duration, mean, sd, extent, self.size or LEAST, int(self._first_ns or 0))
+        return Chunks(time, duration, mean, sd, extent, self.size or MIN_CHUNK_SAMPLES, int(self._first_ns or 0))
 
     def _count_changes(self, columns):
         if self._last is not None:
@@ -112,7 +112,7 @@ class ChunkSeries:
 
 def _size(stamps, chunk_time):
     period = float(np.median(np.diff(stamps[:FIRST]))) * 1e-9
-    return int(np.clip(round(chunk_time / max(period, 1e-6)), LEAST, MOST))
+    return int(np.clip(round(chunk_time / max(period, 1e-6)), MIN_CHUNK_SAMPLES, MAX_CHUNK_SAMPLES))
 
 
 def _describe(time, values):
@@ -126,7 +126,7 @@ def _describe(time, values):
 
 
 LEAST_CHUNKS = 4
-STILL = 0.02
+MAX_CHUNK_TURN = 0.02
 """Largest turn of the measured gravity from one chunk to the next, rad."""
 
 
@@ -209,7 +209,7 @@ def still_chunks(chunks: Chunks) -> np.ndarray:
         quiet &= scatter <= 3.0 * np.quantile(scatter, 0.1) + 1e-3 * np.median(scatter)
     direction = chunks.mean[:, :3] / np.maximum(np.linalg.norm(chunks.mean[:, :3], axis=1, keepdims=True), 1e-12)
     turn = np.linalg.norm(np.diff(direction, axis=0), axis=1)
-    still = quiet & (np.append(turn, 0.0) < STILL) & (np.append(0.0, turn) < STILL)
+    still = quiet & (np.append(turn, 0.0) < MAX_CHUNK_TURN) & (np.append(0.0, turn) < MAX_CHUNK_TURN)
     if still.sum() < LEAST_CHUNKS:
         return still
     rate = np.median(chunks.mean[still, 3:], axis=0)
@@ -227,9 +227,9 @@ def _stretches(still):
 SENSOR_COLUMNS = {'accelerometer': slice(0, 3), 'gyroscope': slice(3, 6)}
 LONG = 4
 """Chunks, one second."""
-STEPS = 2.0
+MIN_NOISE_STEPS = 2.0
 """A sensor with a noise at rest of at least this many converter steps in a chunk is not constant on three axes for a second."""
-TURNS = 0.1
+MIN_TURN_RATE = 0.1
 """Mean rate of a chunk from which on the IMU turns, rad/s."""
 
 
@@ -277,7 +277,7 @@ def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarra
     if rest is None:
         return found
     for sensor, part in SENSOR_COLUMNS.items():
-        noisy = (rest.range[part] >= STEPS * resolution[part]).all() and (rest.range[part] > 0).all()
+        noisy = (rest.range[part] >= MIN_NOISE_STEPS * resolution[part]).all() and (rest.range[part] > 0).all()
         if noisy and len(runs[sensor]) <= len(rest.force):
             for start, stop in runs[sensor]:
                 found[sensor][start:stop] = True
@@ -311,7 +311,7 @@ def frozen_joints(chunks: Chunks, still_ns: np.ndarray, rate_at_rest: np.ndarray
     if not inside.any():
         return []
     rates = chunks.mean[:, 3:]
-    turning = min((np.linalg.norm(rates - rate, axis=1) > TURNS for rate in (rate_at_rest, np.median(rates[inside], axis=0))),
+    turning = min((np.linalg.norm(rates - rate, axis=1) > MIN_TURN_RATE for rate in (rate_at_rest, np.median(rates[inside], axis=0))),
                   key=lambda flags: np.count_nonzero(flags & inside))
     return [_part(chunks, 'joints', start, stop) for start, stop in long_runs(turning & inside)]
 

@@ -21,11 +21,11 @@ class Stamping(StrEnum):
 
 
 REGULAR, COUNTED, IRREGULAR = Stamping
-EARLY, LATE = 0.5, 1.5
+MIN_REGULAR_STEP, MAX_REGULAR_STEP = 0.5, 1.5
 """A step between these many periods is a regular one."""
-WHOLE = 0.1
+WHOLE_STEP_SHARE = 0.1
 """A longer step within this share of a period of an integer number of periods is regular too: samples were lost."""
-IRREGULAR_SHARE = 0.05
+MAX_IRREGULAR_SHARE = 0.05
 """Largest share of irregular steps."""
 MOST_LOST = 4
 """Largest number of lost samples per received one; beyond it the usual step is not the period."""
@@ -43,7 +43,7 @@ SKEWED = 0.35
 """Largest share of the range of times of arrival below their median: 0.5 of symmetric jitter, 0.17 of exponential lateness."""
 PACKET = 1.5
 """Samples received together, on average, from which stamps are those of packets."""
-LEAST = 16
+MIN_PERIOD_STEPS = 16
 """Fewest steps for an estimate of the period."""
 
 
@@ -92,7 +92,7 @@ def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
     """
     step = np.diff(stamp_ns)
     step = step[np.abs(step) <= PAUSE_NS]
-    if len(step) < LEAST:
+    if len(step) < MIN_PERIOD_STEPS:
         return None
     in_order = np.diff(np.sort(stamp_ns))   # exchanged neighbours are no error of the stamps
     in_order = in_order[in_order <= PAUSE_NS]
@@ -112,20 +112,25 @@ def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
 
 
 def _regular(step: np.ndarray, usual: float) -> StampLine | None:
-    if usual <= 0 or regular_share(step, usual) < 1 - IRREGULAR_SHARE:
+    if usual <= 0 or regular_share(step, usual) < 1 - MAX_IRREGULAR_SHARE:
         return None
     number = np.rint(step / usual)
     # the sample is late, and the next one earlier
-    number[(step <= LATE * usual) | ((number < MOST_LOST) & (np.abs(step / usual - number) > WHOLE))] = 1.0
+    number[(step <= MAX_REGULAR_STEP * usual) | ((number < MOST_LOST) & (np.abs(step / usual - number) > WHOLE_STEP_SHARE))] = 1.0
     used = (step > 0) & (number <= MOST_LOST)
     return StampLine(REGULAR, float(step[used].sum() / number[used].sum()))
+
+
+def is_regular(step: np.ndarray, period: float) -> np.ndarray:
+    """Return whether steps are regular ones."""
+    return (step > MIN_REGULAR_STEP * period) & (step <= MAX_REGULAR_STEP * period)
 
 
 def regular_share(step: np.ndarray, period: float) -> float:
     """Return the share of steps consistent with one clock and lost samples; 0 when more than `MOST_LOST` would be lost."""
     number = np.rint(step / period)
     whole = np.abs(step / period - number)
-    good = ((step > EARLY * period) & (step <= LATE * period)) | ((number >= 2) & (whole <= WHOLE))
+    good = is_regular(step, period) | ((number >= 2) & (whole <= WHOLE_STEP_SHARE))
     lost = float(np.sum(number[good] - 1, where=number[good] > 1))
     return 0.0 if lost > MOST_LOST * len(step) else float(good.mean())
 
@@ -147,22 +152,22 @@ def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
     residual = (stamp_ns - stamp_ns[0]) - period * number
     residual = residual - np.polynomial.Polynomial.fit(number, residual, 1)(number)
     low, middle, high = np.quantile(residual, (0.02, 0.5, 0.98))
-    at_once = len(step) / max(int(np.count_nonzero(step > EARLY * period)), 1)
+    at_once = len(step) / max(int(np.count_nonzero(step > MIN_REGULAR_STEP * period)), 1)
     skewed = middle - low < SKEWED * (high - low)
     arrivals = high - low > period and np.all(step >= 0) and (at_once >= PACKET or skewed)
     origin = low if arrivals else middle
     return StampLine(COUNTED, period, low - origin, high - origin, at_once if arrivals else 1.0)
 
 
-BLOCK = LAG
-"""Samples that give one point of the clock."""
-REACH = 32
+CLOCK_BLOCK = LAG
+"""Samples that give one point of the clock; the stamps are classified again after as many."""
+LOSS_REACH = 32
 """Samples on both sides of a long step that decide between lost and late samples; packets are smaller."""
-LOST = 0.6
+LOST_PERIOD_SHARE = 0.6
 """Samples were lost at a long step if the clock is ahead by more than this share of a period after it, relative to before."""
 FOLLOW = 0.05
 """A period that has changed by more than this share is another one; smaller changes are averaged."""
-SLOW = 0.1
+NEW_WEIGHT = 0.1
 """Weight of a new block in that average."""
 
 
@@ -182,7 +187,7 @@ class CountedClock:
 
     def __init__(self, line: StampLine):
         self._period, self._arrivals = line.period_ns, line.arrivals
-        self._margin = LOST * line.period_ns + (0.0 if line.arrivals else 0.25 * (line.high_ns - line.low_ns))
+        self._margin = LOST_PERIOD_SHARE * line.period_ns + (0.0 if line.arrivals else 0.25 * (line.high_ns - line.low_ns))
         self._raw, self._times = np.zeros(0, np.int64), [np.zeros(0, np.int64)]
         self._begin()
 
@@ -200,12 +205,12 @@ class CountedClock:
 
     def take(self, final: bool = False) -> np.ndarray:
         """Return the times that are determined now (all with `final`), int64, ns, in the order of the stamps."""
-        while len(self._raw) >= BLOCK + REACH or (final and len(self._raw)):
-            pause = np.flatnonzero(np.diff(self._raw[:BLOCK + REACH]) > PAUSE_NS)
+        while len(self._raw) >= CLOCK_BLOCK + LOSS_REACH or (final and len(self._raw)):
+            pause = np.flatnonzero(np.diff(self._raw[:CLOCK_BLOCK + LOSS_REACH]) > PAUSE_NS)
             end = len(self._raw) if not len(pause) else int(pause[0]) + 1
-            self._work(self._raw[:min(BLOCK, end)], self._raw[min(BLOCK, end):min(BLOCK + REACH, end)])
-            self._raw = self._raw[min(BLOCK, end):]
-            if len(pause) and end <= BLOCK:
+            self._work(self._raw[:min(CLOCK_BLOCK, end)], self._raw[min(CLOCK_BLOCK, end):min(CLOCK_BLOCK + LOSS_REACH, end)])
+            self._raw = self._raw[min(CLOCK_BLOCK, end):]
+            if len(pause) and end <= CLOCK_BLOCK:
                 self._finish()
         if final:
             self._finish()
@@ -219,9 +224,9 @@ class CountedClock:
         stamp = (np.concatenate([stamp_ns, ahead_ns]) - self._origin_ns).astype(float)
         number = self._numbered(stamp, len(stamp_ns))
         stamp = stamp[:len(stamp_ns)]
-        self._before = np.stack([np.concatenate([self._before[0], number]), np.concatenate([self._before[1], stamp])])[:, -REACH:]
+        self._before = np.stack([np.concatenate([self._before[0], number]), np.concatenate([self._before[1], stamp])])[:, -LOSS_REACH:]
         self._next = number[-1] + 1
-        if len(number) >= BLOCK // 2 or not self._points:   # the few samples of a shorter one may all be late
+        if len(number) >= CLOCK_BLOCK // 2 or not self._points:   # the few samples of a shorter one may all be late
             late = stamp - self._period * number
             usual = late.min() if self._arrivals else late.mean()
             self._points.append((float(number.mean()), float(usual + self._period * number.mean())))
@@ -235,17 +240,17 @@ class CountedClock:
         middle = np.min if self._arrivals else np.median
         number = self._next + np.arange(len(stamp))
         step = np.diff(stamp, prepend=self._before[1, -1] if self._before.shape[1] else stamp[0])
-        for k in np.flatnonzero(step[:count] > LATE * self._period):
-            past = np.concatenate([self._before[1] - self._period * self._before[0], stamp[:k] - self._period * number[:k]])[-REACH:]
+        for k in np.flatnonzero(step[:count] > MAX_REGULAR_STEP * self._period):
+            past = np.concatenate([self._before[1] - self._period * self._before[0], stamp[:k] - self._period * number[:k]])[-LOSS_REACH:]
             if len(past):
-                jump = middle(stamp[k:k + REACH] - self._period * number[k:k + REACH]) - middle(past)
+                jump = middle(stamp[k:k + LOSS_REACH] - self._period * number[k:k + LOSS_REACH]) - middle(past)
                 number[k:] += np.round(jump / self._period) if jump > self._margin else 0.0
         return number[:count]
 
     def _tell(self, number: np.ndarray) -> None:
         """Compute the times of a block, from its point and the points of its neighbours."""
         points = np.array(self._points)
-        ends = (points[0] - (BLOCK, BLOCK * self._period), points[-1] + (BLOCK, BLOCK * self._period))
+        ends = (points[0] - (CLOCK_BLOCK, CLOCK_BLOCK * self._period), points[-1] + (CLOCK_BLOCK, CLOCK_BLOCK * self._period))
         points = np.vstack([ends[0], points, ends[1]])
         times = np.interp(number, points[:, 0], points[:, 1])
         self._times.append(self._origin_ns + np.rint(times).astype(np.int64))
@@ -256,7 +261,7 @@ class CountedClock:
             return
         (n0, t0), (n1, t1) = self._points[-2:]
         period = (t1 - t0) / (n1 - n0)
-        self._period = period if abs(period - self._period) > FOLLOW * self._period else self._period + SLOW * (period - self._period)
+        self._period = period if abs(period - self._period) > FOLLOW * self._period else self._period + NEW_WEIGHT * (period - self._period)
         self._points = self._points[-2:]
 
     def _finish(self) -> None:
@@ -268,7 +273,7 @@ class CountedClock:
 
 RARE = 4
 """Counted stamps are reviewed once in this number of blocks."""
-HISTORY = 4 * LAG
+STAMP_HISTORY = 4 * LAG
 """Number of stamps for the decision between counted and irregular."""
 
 
@@ -301,9 +306,9 @@ class SampleTimes:
             return samples
         samples, ready = self._without_repeated(samples), []
         while len(samples):
-            part, samples = samples.select(slice(0, BLOCK - self._unseen)), samples.select(slice(BLOCK - self._unseen, None))
-            self._unseen = (self._unseen + len(part)) % BLOCK
-            self._history = np.concatenate([self._history, part.stamp_ns])[-HISTORY:]
+            part, samples = samples.select(slice(0, CLOCK_BLOCK - self._unseen)), samples.select(slice(CLOCK_BLOCK - self._unseen, None))
+            self._unseen = (self._unseen + len(part)) % CLOCK_BLOCK
+            self._history = np.concatenate([self._history, part.stamp_ns])[-STAMP_HISTORY:]
             ready += self._take(part)
         return _joined(ready)
 
@@ -320,10 +325,10 @@ class SampleTimes:
         if self._learning or self._clock is not None or self.line is None or not len(samples):
             return False
         step = np.diff(np.concatenate([self._history[-self._unseen - 1:], samples.stamp_ns]))   # the complete block of the next review
-        if not np.all((step > EARLY * self.line.period_ns) & (step <= LATE * self.line.period_ns)):
+        if not np.all(is_regular(step, self.line.period_ns)):
             return False
-        self._unseen = (self._unseen + len(samples)) % BLOCK
-        self._history = np.concatenate([self._history, samples.stamp_ns[-HISTORY:]])[-HISTORY:]
+        self._unseen = (self._unseen + len(samples)) % CLOCK_BLOCK
+        self._history = np.concatenate([self._history, samples.stamp_ns[-STAMP_HISTORY:]])[-STAMP_HISTORY:]
         self._last = samples.select(slice(len(samples) - 1, None))
         return True
 
@@ -344,8 +349,9 @@ class SampleTimes:
         if self._learning:
             self._held = part if self._held is None else ImuSamples.concatenate([self._held, part])
             stamp_ns = self._held.stamp_ns
-            line = describe_stamps(stamp_ns[:LEAST + 1] if len(stamp_ns) < HISTORY else stamp_ns) if len(stamp_ns) > LEAST else None
-            if line is None and len(stamp_ns) < HISTORY:
+            some = stamp_ns[:MIN_PERIOD_STEPS + 1] if len(stamp_ns) < STAMP_HISTORY else stamp_ns
+            line = describe_stamps(some) if len(stamp_ns) > MIN_PERIOD_STEPS else None
+            if line is None and len(stamp_ns) < STAMP_HISTORY:
                 return []
             self._learning = False
             return self._judge(line) + self._on(None)
@@ -379,15 +385,14 @@ class SampleTimes:
     def odd_line(self, count: int) -> StampLine | None:
         """Return the relation of the irregular stamps to the sampling, when it concerns more than a few of `count` samples."""
         number, word = max((self.n_rebuilt, COUNTED), (self.n_irregular, IRREGULAR))
-        return self._odd_lines.get(word) if number > IRREGULAR_SHARE * count else None
+        return self._odd_lines.get(word) if number > MAX_IRREGULAR_SHARE * count else None
 
     def _odd(self) -> bool:
         """Return whether the steps of the last block differ from the known clock."""
         if self.line is None:
             return True
-        step = np.diff(self._history[-BLOCK - 1:])
-        regular = (step > EARLY * self.line.period_ns) & (step <= LATE * self.line.period_ns)
-        return bool(np.count_nonzero(~regular) > IRREGULAR_SHARE * len(step))
+        step = np.diff(self._history[-CLOCK_BLOCK - 1:])
+        return bool(np.count_nonzero(~is_regular(step, self.line.period_ns)) > MAX_IRREGULAR_SHARE * len(step))
 
     def _judge(self, line: StampLine | None) -> list:
         """Start or stop counting according to the stamps; return the samples that become ready."""

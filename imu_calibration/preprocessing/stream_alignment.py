@@ -9,7 +9,7 @@ import numpy as np
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch
 from imu_calibration.preprocessing import window_cutter
-from imu_calibration.preprocessing.rest_detection import REACH, QuietFloor, quiet_beside_joints
+from imu_calibration.preprocessing.rest_detection import QUIETNESS_REACH, QuietFloor, quiet_beside_joints
 from imu_calibration.preprocessing.window import PhasedSamples, WindowSettings
 from imu_calibration.preprocessing.window_cutter import LEAST_READINGS, LOST, STILL, JointRun
 
@@ -71,7 +71,7 @@ JOINT_WAIT = 60.0
 """The IMU or the joints may be ahead of each other by this much before missing samples are skipped, s."""
 TEMPERATURE_WAIT = 5.0
 """Largest delay of the temperature relative to the IMU, s."""
-_LEAST_MARGIN = max(window_cutter.REACH, REACH) + 0.4
+_LEAST_MARGIN = max(window_cutter.PHASE_REACH, QUIETNESS_REACH) + 0.4
 NEVER = 1 << 62
 
 

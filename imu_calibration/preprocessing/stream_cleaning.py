@@ -262,9 +262,9 @@ class StepHistogram:
 STREAMS = ('imu', 'joints', 'temperature')
 MESSAGES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
 """Stream -> message type; names of reasons for lost messages begin with it."""
-BATCH = 200
+CLEANING_BATCH = 200
 """Samples that are cleaned together: cleaning has a fixed cost per call."""
-_KINDS: dict[str, Any] = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
+_SAMPLE_TYPES: dict[str, Any] = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,7 +346,7 @@ class BlockCleaner:
 
     def push(self, block: SampleBlock) -> CleanedBlock:
         """
-        Add a block and return the samples usable now; small blocks are collected up to `BATCH` samples.
+        Add a block and return the samples usable now; small blocks are collected up to `CLEANING_BATCH` samples.
 
         Raises
         ------
@@ -361,7 +361,7 @@ class BlockCleaner:
             samples = getattr(block, name)
             if samples is not None and len(samples):
                 self._raw[name].append(self._in_our_terms(name, samples))
-        if self.n_buffered < BATCH:
+        if self.n_buffered < CLEANING_BATCH:
             return CleanedBlock()
         self._clean()
         return self._hand_on()
@@ -385,7 +385,7 @@ class BlockCleaner:
     def _clean(self) -> None:
         for name, parts in self._raw.items():
             if parts:
-                self._ready[name] += self._checks[name].push(parts[0] if len(parts) == 1 else _KINDS[name].concatenate(parts))
+                self._ready[name] += self._checks[name].push(parts[0] if len(parts) == 1 else _SAMPLE_TYPES[name].concatenate(parts))
                 self._raw[name] = []
 
     def _hand_on(self):

@@ -11,7 +11,7 @@ from imu_calibration.preprocessing.window_cutter import dropped
 
 SILENT_AFTER = 2.0
 """Seconds without a message after which a stream counts as silent; also the lead of one stream's stamps over the other's."""
-RECENT = 10.0
+RECENT_SECONDS = 10.0
 """Seconds for which a loss is called recent."""
 COLD_AFTER = 10.0
 """The same for temperatures, of which one per second is usual."""
@@ -129,7 +129,7 @@ class StreamWatch:
 
     def _recently(self, now, beginning=''):
         """Return the recently dropped samples for reasons with that beginning; '' if none."""
-        if self._lost_at is None or now - self._lost_at >= RECENT:
+        if self._lost_at is None or now - self._lost_at >= RECENT_SECONDS:
             return ''
         return ', '.join(f'{count} {reason}' for reason, count in self._recent.items() if reason.startswith(beginning))
 
@@ -145,7 +145,7 @@ class StreamWatch:
                              'bring the clocks together')
         if self._stamping is not None and self._stamping.word == IRREGULAR:
             return TROUBLE, f"{self._stamping}: sampling times are unknown; the driver should stamp by the sensor's clock"
-        if self._unstamped_at is not None and now - self._unstamped_at < RECENT:
+        if self._unstamped_at is not None and now - self._unstamped_at < RECENT_SECONDS:
             notes = ', '.join(f'{count} {reason}' for reason, count in self._notes.items())
             return TROUBLE, f'{notes}: the driver sets none, the time of arrival is used'
         if recently := self._recently(now):

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.units import DEG, OTHER_UNITS, STANDARD_GRAVITY, significant, unit_of_rest
+from imu_calibration.core.units import DEG, GRAVITY_PLACE_SHARE, OTHER_UNITS, STANDARD_GRAVITY, significant, unit_of_rest
 from imu_calibration.preprocessing.full_scale import FACTORS, nearest_power
-from imu_calibration.preprocessing.on_table import CLEAR, match_axes
+from imu_calibration.preprocessing.on_table import MIN_MATCH, match_axes
 from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING, CheckFinding, RecordingEvidence
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 
@@ -15,7 +15,7 @@ CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 
 GRAVITY_SHARE = 0.02
 LINEAR = 0.8
 """m/s^2; a shorter specific force at rest is noise and bias of an acceleration without gravity. Readings in g have at least 0.8."""
-FASTEST = 100.0
+MAX_GYRO_RATE = 100.0
 """rad/s, 5700 deg/s: above the range of nearly all gyroscopes."""
 FASTEST_DEG = 5000.0
 """Numbers above it are no deg/s either."""
@@ -29,10 +29,8 @@ LEAST_RANGE = 0.4
 """rad/s, 23 deg/s: a largest rate below it is not the end of the range of a gyroscope."""
 MOST_BIAS = {'accelerometer': 0.25 * STANDARD_GRAVITY, 'gyroscope': 60 * DEG}
 """m/s^2, rad/s: several times the specification of the cheapest grades (0.1 g, 20 deg/s)."""
-PLACE = 0.005
-"""Share by which gravity differs between places: 9.78 to 9.83 m/s^2."""
 REPEATED_SHARE = 0.05
-ROUNDING = 1e-6
+MIN_CONVERTER_STEP = 1e-6
 """m/s^2, rad/s; no converter is that fine."""
 
 
@@ -85,7 +83,7 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             yield _unit('rate_unit', f'{came}counts or volts?; {convert}')
         else:
             yield CheckFinding('rate_unit', GOOD, f'angular rate in rad/s: gravity rotates according to the rates{_about(turning.axes)}')
-    elif largest > FASTEST:
+    elif largest > MAX_GYRO_RATE:
         unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
         yield _unit('rate_unit', f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
                                  f'{convert}')
@@ -127,7 +125,7 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         return
     what = ', '.join(f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}" for i, j,
                      sign in match.exchanges(turning.seen))
-    if not what or match.agreement < CLEAR:
+    if not what or match.agreement < MIN_MATCH:
         what = 'no exchange of axes makes them fit'
     kinds = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}
     kind = kinds.get((match.turned, match.mirrored), 'turned or left-handed, not separable in this recording')
@@ -203,7 +201,7 @@ def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                            f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, '
                            f'the accelerometer reads {rest.length:.3f} ({what}), '
                       f'{100 * off:+.1f} %: scale or bias is wrong (gravity differs by '
-                      f'{100 * PLACE} % between sites)')
+                      f'{100 * GRAVITY_PLACE_SHARE} % between sites)')
     else:
         yield CheckFinding('gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})')
 
@@ -226,7 +224,7 @@ def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     for sensor, part, unit in CHANNELS:
         step, range_ = evidence.resolution[part], evidence.rest.range[part]
         # Rounding shows as few different readings; noise of one sd spans about four in a chunk.
-        coarse = (step > ROUNDING) & (4 * step > range_)
+        coarse = (step > MIN_CONVERTER_STEP) & (4 * step > range_)
         constant = coarse & (range_ == 0)
         if coarse.any():
             size = step[coarse].max()

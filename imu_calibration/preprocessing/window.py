@@ -125,17 +125,17 @@ def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason =
                   samples.joint_step.max(axis=0), samples.corrected)
 
 
-CHUNK = 4096
+WINDOW_GROUP_SAMPLES = 4096
 """Samples whose columns or predictions are in memory at once."""
 
 
 def chunks(windows: Sequence[Window]) -> Iterator[list[Window]]:
-    """Yield the windows in groups of more than `CHUNK` samples, in order."""
+    """Yield the windows in groups of more than `WINDOW_GROUP_SAMPLES` samples, in order."""
     part, size = [], 0
     for window in windows:
         part.append(window)
         size += len(window.motion)
-        if size > CHUNK:
+        if size > WINDOW_GROUP_SAMPLES:
             yield part
             part, size = [], 0
     if part:

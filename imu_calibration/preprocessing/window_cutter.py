@@ -32,7 +32,7 @@ RATE_SPAN = 0.2
 """Rates are slopes over this time, s: long enough for encoders, short against `settling`."""
 LONGEST_SPAN = 1.0
 """A rest or a steady turn must show over this time (or the shortest window, if that is less), s."""
-REACH = RATE_SPAN / 2 + LONGEST_SPAN
+PHASE_REACH = RATE_SPAN / 2 + LONGEST_SPAN
 """Readings at a larger distance do not change a phase, s."""
 
 
@@ -201,10 +201,10 @@ class JointRun:
 
 BEST_BIAS, BEST_TIME = 1e-4, 100.0
 """m/s^2 and s: the best accelerometers hold their bias to 10 ug over minutes (a Gauss-Markov process; field figures in `sensor_noise`)."""
-PIECE = 0.25
+PIECE_SECONDS = 0.25
 """Duration of the means from which noise at low frequency is estimated, s: longer than sensor filters."""
-LEAST_PIECES = 4
-SHORTEST = 5.0
+MIN_NOISE_PIECES = 4
+MIN_MOVING_SECONDS = 5.0
 """Least length of moving windows, s."""
 
 
@@ -224,9 +224,9 @@ class WanderLimit:
     def rested(self, samples: PhasedSamples) -> None:
         """Estimate the noise density from a window at rest."""
         period = _period(samples)
-        length = int(round(PIECE / period)) if period > 0 else 0
+        length = int(round(PIECE_SECONDS / period)) if period > 0 else 0
         pieces = len(samples) // length if length else 0
-        if pieces >= LEAST_PIECES:
+        if pieces >= MIN_NOISE_PIECES:
             means = samples.force_s[:pieces * length].reshape(pieces, length, 3).mean(axis=1)
             self._densities.append(float(np.sqrt(np.median(np.diff(means, axis=0).var(axis=0) / 2) * length * period)))
 
@@ -238,7 +238,7 @@ class WanderLimit:
         jitter = np.diff(samples.time, 2).std() / np.sqrt(6)
         if STANDARD_GRAVITY * np.sqrt((samples.rate_s**2).sum(axis=1).mean()) * jitter * np.sqrt(_period(samples)) > density:
             return 1
-        longest = max(SHORTEST, density * np.sqrt(BEST_TIME / 2) / BEST_BIAS)
+        longest = max(MIN_MOVING_SECONDS, density * np.sqrt(BEST_TIME / 2) / BEST_BIAS)
         return ceil((samples.time[-1] - samples.time[0]) / longest)
 
 
@@ -246,10 +246,10 @@ def _period(samples):
     return (samples.time[-1] - samples.time[0]) / max(len(samples) - 1, 1)
 
 
-_KINDS, _REASONS = tuple(WindowKind), tuple(UnusedReason)
-UNUSED, STATIC, SPIN, DYNAMIC = range(len(_KINDS))
-_SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT, _REST_TOO_SHORT = range(1, len(_REASONS))
-_LEAST_SAMPLES = 5
+_WINDOW_KINDS, _UNUSED_REASONS = tuple(WindowKind), tuple(UnusedReason)
+UNUSED, STATIC, SPIN, DYNAMIC = range(len(_WINDOW_KINDS))
+_SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT, _REST_TOO_SHORT = range(1, len(_UNUSED_REASONS))
+_MIN_WINDOW_SAMPLES = 5
 
 
 class WindowCutter:
@@ -391,9 +391,9 @@ class WindowCutter:
     def _finished(self, samples, kind, reason):
         n = len(samples)
         length = (samples.time[-1] - samples.time[0]) * n / max(n - 1, 1)
-        if length < self._least(kind) or (kind != UNUSED and n < _LEAST_SAMPLES):
+        if length < self._least(kind) or (kind != UNUSED and n < _MIN_WINDOW_SAMPLES):
             kind, reason = UNUSED, _REST_TOO_SHORT if kind == STATIC else _TOO_SHORT
-        key = _REASONS[reason] if kind == UNUSED else _KINDS[kind]
+        key = _UNUSED_REASONS[reason] if kind == UNUSED else _WINDOW_KINDS[kind]
         self.counts[key] = self.counts.get(key, 0) + n
         if kind == UNUSED and not self._keep_unused:
             return []
@@ -401,7 +401,7 @@ class WindowCutter:
             self._wander.rested(samples)
         pieces = self._wander.pieces(samples) if kind == DYNAMIC else 1
         bounds = np.linspace(0, n, pieces + 1).astype(int)
-        return [make_window(samples.select(slice(start, stop)), _KINDS[kind], _REASONS[reason])
+        return [make_window(samples.select(slice(start, stop)), _WINDOW_KINDS[kind], _UNUSED_REASONS[reason])
                 for start, stop in zip(bounds[:-1], bounds[1:], strict=True)]
 
 
@@ -417,7 +417,7 @@ def _between_motion(k, before, original, after_gap, stop):
     return before[k] in (STEADY, MOVING) and follows
 
 
-ACCEPTED = (*_KINDS[1:], *_REASONS[1:], 'edge of joints')
+ACCEPTED = (*_WINDOW_KINDS[1:], *_UNUSED_REASONS[1:], 'edge of joints')
 """Counts of complete samples; the last six are excluded from windows on purpose."""
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.allan.figures import NoiseFigures, bias_processes
 from imu_calibration.core.samples import NominalScaling
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.effects.sensor_model import DEFAULT, SensorModel, parse_effects, parse_reference, with_common_arm
+from imu_calibration.effects.sensor_model import DEFAULT_MODEL, SensorModel, parse_effects, parse_reference, with_common_arm
 from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowSettings
@@ -60,10 +60,10 @@ def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
     """
     names = table.joint_names
     asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
-    chosen = {sensor: parse_effects(sensor, text or DEFAULT[sensor], names, catalogue=options.catalogue) for sensor, text in asked.items()}
+    chosen = {sensor: parse_effects(sensor, text or DEFAULT_MODEL[sensor], names, catalogue=options.catalogue)
+              for sensor, text in asked.items()}
     model = SensorModel(chosen['accelerometer'], chosen['gyroscope'], reference=parse_reference(options.reference_model, table),
-                        joint_names=names,
-                        catalogue=options.catalogue)
+                        joint_names=names, catalogue=options.catalogue)
     model = with_common_arm(model) if table.mount_xyz is None else model
     for sensor, name in options.added:
         model = model if (sensor, name) in model.slices else model.with_effect(sensor, name)

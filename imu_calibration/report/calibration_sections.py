@@ -12,7 +12,7 @@ from imu_calibration.core.units import error_text, for_people
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import harmed, ratio_text
 from imu_calibration.document.trust import usage
-from imu_calibration.effects.base import SENSORS, SHORT
+from imu_calibration.effects.base import PREFIXES, SENSORS
 from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.papers.zhang2017 import axis_readings
 from imu_calibration.references.options import CalibrationOptions
@@ -154,8 +154,8 @@ def _correlation(calibration, live):
 def short_name(name: str) -> str:
     """Return a parameter or effect name that fits a figure."""
     sensor, _, rest = name.partition('.')
-    rest = rest.removeprefix(SHORT.get(sensor, '') + '_').replace('_', ' ').replace('.', ' ')
-    return rest if sensor == 'reference' else f'{SHORT[sensor]} {rest}'
+    rest = rest.removeprefix(PREFIXES.get(sensor, '') + '_').replace('_', ' ').replace('.', ' ')
+    return rest if sensor == 'reference' else f'{PREFIXES[sensor]} {rest}'
 
 
 class _Bars:
@@ -232,8 +232,8 @@ class _Correlation:
         bar.outline.set_visible(False)
 
 
-COLOURS = {'noise': '#1f66a8', 'levelling': '#c0561b', 'joint position': '#2b8a57', 'table rate': '#8a5aa8', 'gravity': '#b8860b'}
-LOWEST = 1e-5
+CAUSE_COLOURS = {'noise': '#1f66a8', 'levelling': '#c0561b', 'joint position': '#2b8a57', 'table rate': '#8a5aa8', 'gravity': '#b8860b'}
+MIN_DRAWN_SHARE = 1e-5
 """Shares of the tolerance below this are drawn at the edge."""
 
 
@@ -279,13 +279,13 @@ class _Dots:
         for cause, values in self.budget.causes.items():
             share = np.array([np.max(values[part] / self.result.tolerances[part]) for _, part in effects])
             highest = max(highest, share.max())
-            shown = share > LOWEST
-            axes.plot(share[shown], place[shown], 'o', color=COLOURS.get(cause, INK), label=cause, markersize=6, ls='none')
+            shown = share > MIN_DRAWN_SHARE
+            axes.plot(share[shown], place[shown], 'o', color=CAUSE_COLOURS.get(cause, INK), label=cause, markersize=6, ls='none')
         total = np.array([np.max(self.budget.total[part] / self.result.tolerances[part]) for _, part in effects])
         axes.plot(total, place, '|', color=INK, markersize=13, mew=1.6, label='total', ls='none')
         axes.axvline(1.0, color=INK, lw=1.0)
         log_axis(axes.xaxis)
-        axes.set_xlim(LOWEST, 3 * highest)
+        axes.set_xlim(MIN_DRAWN_SHARE, 3 * highest)
         axes.set_ylim(-0.7, len(effects) - 0.3)
         axes.set_yticks(place, [short_name(f'{e.sensor}.{e.name}') for e, _ in effects])
         axes.tick_params(axis='y', length=0)
@@ -293,7 +293,7 @@ class _Dots:
         axes.legend(ncols=6, loc='lower center', bbox_to_anchor=(0.45, 1.0), columnspacing=1.2, handletextpad=0.1)
 
 
-LEVEL = 0.02
+LEVEL_FORCE_SHARE = 0.02
 """Windows with a mean specific force further than this share from 1 g turn through the vertical and have no reading at 1 g."""
 
 
@@ -301,7 +301,7 @@ def reading_tables(result: CalibrationResult, errors: WindowErrors) -> list[list
     """Return two lists of lines: at rest (Table 2) and in rotation (Table 4)."""
     gravity = result.gravity
     true = errors.true['accelerometer']
-    chosen = (np.abs(np.linalg.norm(true, axis=1) / gravity - 1) < LEVEL) & (errors.kind != 'dynamic')
+    chosen = (np.abs(np.linalg.norm(true, axis=1) / gravity - 1) < LEVEL_FORCE_SHARE) & (errors.kind != 'dynamic')
     lines = axis_readings(errors.measured['accelerometer'][chosen], (true + errors.after['accelerometer'])[chosen], true[chosen],
                           rate=np.linalg.norm(errors.true['gyroscope'][chosen], axis=1), gravity=gravity)
     return [_lines([line for line in lines if (line.rate_deg_s == 0) == at_rest]) for at_rest in (True, False)]

@@ -9,7 +9,7 @@ from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisRe
 from imu_calibration.core.units import for_people
 from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.document.verdict import judge
-from imu_calibration.effects.base import AXES, SENSORS, UNIT
+from imu_calibration.effects.base import AXES, SENSORS, UNITS
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, Drawn, draw, draw_tones
 from imu_calibration.report.overlay import overlay_section, variables
 from imu_calibration.report.page import in_unit, parameter_groups, people, render, text
@@ -19,7 +19,7 @@ FEW = 200
 """Below this number of points the effect is drawn against its own prediction, with points that can be seen."""
 SPAN = {'windows': 'over 0.25 s', 'poses': 'of each pose'}
 """Averaging span of a point of a residual over time."""
-CLEAR = 0.5
+MIN_DRAWN_FIT = 0.5
 """Share of the fitted effect that a single variable must explain for the effect to be drawn against it."""
 
 
@@ -71,7 +71,7 @@ def _reasons(diagnosis, rests):
     if not lines and not rests:
         lines = [(f'None of the {len(diagnosis.candidates)} effects under test explains more than noise.', '')]
     for sensor, rest in rests:
-        rms = in_unit(rest.rms, rest.unit or UNIT[sensor])
+        rms = in_unit(rest.rms, rest.unit or UNITS[sensor])
         if rest.proposal is not None:
             lines.append((f'{rms} rms of the {sensor} residual match no effect of the catalogue; they follow '
                           f'{" and ".join(rest.proposal.columns)}.', f'to confirm the formula: {rest.proposal.motion}'))
@@ -96,9 +96,9 @@ def _tiles(diagnosis):
               'note': f'{len(diagnosis.not_testable)} more could not be tested'}]
     if diagnosis.findings:
         gain = diagnosis.gain
-        number, _, unit = in_unit(gain.heldout_rms_after, UNIT[gain.sensor]).partition(' ')
+        number, _, unit = in_unit(gain.heldout_rms_after, UNITS[gain.sensor]).partition(' ')
         tiles.append({'what': f'{gain.of} ({gain.sensor}, held-out {gain.measure})', 'number': number, 'unit': unit,
-                      'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]), 'note': _reduction(gain)})
+                      'before': in_unit(gain.heldout_rms_before, UNITS[gain.sensor]), 'note': _reduction(gain)})
     navigation = diagnosis.traces.dead_reckoning
     if navigation and diagnosis.findings:
         tiles.append({'what': f'position error after {text(navigation["seconds"], 2)} s', 'number': text(navigation['position_after']),
@@ -121,7 +121,7 @@ def _finding(diagnosis, finding, number):
 
 
 def _gained(gain):
-    return {'before': in_unit(gain.heldout_rms_before, UNIT[gain.sensor]), 'after': in_unit(gain.heldout_rms_after, UNIT[gain.sensor]),
+    return {'before': in_unit(gain.heldout_rms_before, UNITS[gain.sensor]), 'after': in_unit(gain.heldout_rms_after, UNITS[gain.sensor]),
             'reduction': _reduction(gain), 'sensor': gain.sensor, 'of': gain.of, 'measure': gain.measure}
 
 
@@ -178,8 +178,8 @@ def cause_of(diagnosis: Diagnosis, sensor: str, against: Sequence[str]) -> tuple
     best = max(((explained_share(values, signal[:, axis]), label, values)
                 for label, (kind, values) in variables(traces, diagnosis.baseline.model.joint_names).items() if kind in kinds),
                default=(0.0, '', None), key=lambda entry: entry[0])
-    if best[2] is None or best[0] < CLEAR:
-        factor, unit = for_people(UNIT[sensor])
+    if best[2] is None or best[0] < MIN_DRAWN_FIT:
+        factor, unit = for_people(UNITS[sensor])
         return axis, f'prediction of the effect, {unit}', signal[:, axis] * factor
     return axis, best[1], best[2]
 
@@ -193,7 +193,7 @@ class _AgainstCause:
     def __call__(self, figure):
         traces, sensor = self.diagnosis.traces, self.sensor
         axis, label, values = cause_of(self.diagnosis, sensor, self.against)
-        factor, unit = for_people(UNIT[sensor])
+        factor, unit = for_people(UNITS[sensor])
         before, after = (residual[sensor][:, axis] * factor for residual in (traces.before, traces.after))
         left, right = figure.subplots(1, 2, sharey=True)
         some = slice(None, None, max(1, len(values) // 2500))
@@ -234,7 +234,7 @@ class _OverTime:
 
     def __call__(self, figure):
         for axes, sensor in zip(figure.subplots(2, 1, sharex=True), SENSORS):
-            factor, unit = for_people(UNIT[sensor])
+            factor, unit = for_people(UNITS[sensor])
             some = slice(None, None, max(1, len(self.traces.time) // 3000))
             for residual, colour, label in ((self.traces.before, BEFORE, 'before'), (self.traces.after, AFTER, 'after')):
                 size = np.sqrt((residual[sensor]**2).sum(axis=1)) * factor
@@ -268,5 +268,5 @@ def _goes_with(rest):
 
 
 def _rest(sensor, rest):
-    return {'sensor': sensor, 'significant': rest.significant, 'rms': in_unit(rest.rms, rest.unit or UNIT[sensor]),
+    return {'sensor': sensor, 'significant': rest.significant, 'rms': in_unit(rest.rms, rest.unit or UNITS[sensor]),
             'sigma': text(rest.sigma, 2), 'with': _goes_with(rest)}

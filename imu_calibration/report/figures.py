@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.installation_angles import PAIRS, derive, in_paper_units
+from imu_calibration.calibration.installation_angles import AXIS_PAIRS, derive, in_paper_units
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.compensation.compensate import arms_of
 from imu_calibration.core.units import DEG, decimals
 from imu_calibration.document import files
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.report.page import fixed, pair
-from imu_calibration.selection.spectrum import CLEAR
+from imu_calibration.selection.spectrum import MIN_LINE_POWER
 from imu_calibration.selection.unexplained import Unexplained
 
 
@@ -66,16 +66,16 @@ class Drawn(str):
                  'lines': [(line.get_label(), *line.get_data()) for line in axes.get_lines()]} for axes in self.axes]
 
 
-INK, GREY, FAINT, GRID = '#1b2430', '#5c6877', '#98a2b0', '#e3e8ee'
+INK, GREY, FAINT, GRID_GREY = '#1b2430', '#5c6877', '#98a2b0', '#e3e8ee'
 BEFORE, AFTER = '#d55e00', '#0072b2'
-AXIS = {'x': '#d55e00', 'y': '#009e73', 'z': '#0072b2'}
+AXIS_COLOURS = {'x': '#d55e00', 'y': '#009e73', 'z': '#0072b2'}
 """Colours of the three axes: vermilion, bluish green and blue of Okabe and Ito, distinct for colour-blind readers."""
 STATUS = {'determined': '#2b8a57', 'weak': '#d08a12', 'held': '#b4322c'}
 MARKER = {'x': 'o', 'y': 's', 'z': '^'}
 STYLE: Any = {
     'font.family': 'sans-serif', 'font.sans-serif': ['DejaVu Sans'], 'font.size': 9.5, 'axes.titlesize': 10, 'axes.titleweight': 'bold',
     'axes.titlelocation': 'left', 'axes.labelsize': 9.5, 'axes.labelcolor': GREY, 'axes.edgecolor': FAINT, 'axes.linewidth': 0.8,
-    'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True, 'axes.axisbelow': True, 'grid.color': GRID,
+    'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True, 'axes.axisbelow': True, 'grid.color': GRID_GREY,
     'grid.linewidth': 0.8, 'xtick.color': FAINT, 'ytick.color': FAINT, 'xtick.labelcolor': GREY, 'ytick.labelcolor': GREY,
     'xtick.labelsize': 8.5, 'ytick.labelsize': 8.5, 'text.color': INK, 'legend.frameon': False, 'legend.fontsize': 8.5,
     'legend.handlelength': 1.4, 'figure.facecolor': 'none', 'axes.facecolor': 'none', 'savefig.facecolor': 'none', 'lines.linewidth': 1.5,
@@ -156,7 +156,7 @@ def decade(value: float) -> str:
 def axis_legend(axes: Any, where: str = 'upper right', **more: Any) -> None:
     """Draw the legend of the three sensor axes."""
     from matplotlib.lines import Line2D
-    handles = [Line2D([], [], color=colour, marker=MARKER[name], markersize=4, lw=0, label=name) for name, colour in AXIS.items()]
+    handles = [Line2D([], [], color=colour, marker=MARKER[name], markersize=4, lw=0, label=name) for name, colour in AXIS_COLOURS.items()]
     axes.legend(handles=handles, loc=where, ncols=3, columnspacing=1.0, handletextpad=0.2, **more)
 
 
@@ -177,7 +177,7 @@ class _Spectra:
     def __call__(self, figure):
         for axes, tone in zip(np.atleast_1d(figure.subplots(len(self.tones), 1)), self.tones):
             axes.plot(tone.frequencies, tone.power, color=AFTER, lw=0.9)
-            axes.axhline(CLEAR, color=GREY, lw=0.6)
+            axes.axhline(MIN_LINE_POWER, color=GREY, lw=0.6)
             axes.axvline(tone.frequency, color=INK, lw=0.8, ls=':')
             log_axis(axes.yaxis)
             axes.set_ylabel(f'{tone.sensor} {tone.axis}: power / around')
@@ -195,7 +195,7 @@ def derived_section(result: CalibrationResult) -> list[dict[str, Any]]:
 def _derived(found, nominal):
     angles = [[' ± '.join(pair(v / DEG, s / DEG)) for v, s in zip(*rows)] for rows in zip(found.angles, found.angles_sd)]
     between = [('xyz'[i] + '–' + 'xyz'[j], ' ± '.join(pair(v / DEG, s / DEG)))
-               for (i, j), v, s in zip(PAIRS, found.between, found.between_sd)]
+               for (i, j), v, s in zip(AXIS_PAIRS, found.between, found.between_sd)]
     lines = [{'what': what, 'unit': unit, 'values': [' ± '.join(pair(v, s)) for v, s in zip(values, sds)]}
              for what, unit, values, sds in in_paper_units(found, nominal)]
     ppm = [fixed((v - 1) * 1e6, decimals(max(s, 1e-12) * 1e6)) for v, s in zip(found.scale, found.scale_sd)]
@@ -225,7 +225,7 @@ class _Arms:
         for axes, (across, up) in zip(figure.subplots(1, 3), PLANES):
             axes.axhline(0, color=GREY, lw=0.6)
             axes.axvline(0, color=GREY, lw=0.6)
-            for element, colour in enumerate(AXIS.values()):
+            for element, colour in enumerate(AXIS_COLOURS.values()):
                 self._point(axes, element, across, up, colour)
             axes.plot(0, 0, '+', color=INK, markersize=9, mew=1.3)
             axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect='equal', xlabel=f'{"xyz"[across]}, mm', ylabel=f'{"xyz"[up]}, mm')

@@ -16,11 +16,11 @@ from imu_calibration.kinematics.strapdown import strapdown
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, draw, log_axis
 from imu_calibration.report.page import text
 
-SECONDS = 50.0
+REST_RUN_SECONDS = 50.0
 """Length of the runs at rest, the papers' own."""
-STEPS = 101
-MOST_POSES = 60
-SHORTEST = 5.0
+RUN_INSTANTS = 101
+MAX_RUNS = 60
+MIN_DRAWN_SECONDS = 5.0
 """Moving stretches shorter than this are not drawn, s."""
 
 
@@ -67,10 +67,10 @@ def rest_growth(errors: WindowErrors) -> Growth | None:
 
     Each run starts from the true attitude and feels the mean error that its window showed, as a constant.
     """
-    static = np.flatnonzero(errors.kind == 'static')[:MOST_POSES]
+    static = np.flatnonzero(errors.kind == 'static')[:MAX_RUNS]
     if not len(static):
         return None
-    time = np.linspace(0.0, SECONDS, STEPS)
+    time = np.linspace(0.0, REST_RUN_SECONDS, RUN_INSTANTS)
     before = errors.before
     return _growth(time,
                    [_rest_run(time, errors.true['accelerometer'][k], before['accelerometer'][k], before['gyroscope'][k]) for k in static])
@@ -91,8 +91,8 @@ def expected_growth(result: CalibrationResult, errors: WindowErrors) -> tuple[Gr
     error d of the specific force gives ``d t``, ``d t^2 / 2``, one w of the rate across the vertical ``g w t^2 / 2``, ``g w t^3 / 6``;
     white noise of density N gives ``N t^(1/2)``, ``N t^(3/2) / 3^(1/2)`` and ``g N t^(3/2) / 3^(1/2)``, ``g N t^(5/2) / 20^(1/2)``.
     """
-    static = np.flatnonzero(errors.kind == 'static')[:MOST_POSES]
-    time = np.linspace(0.0, SECONDS, STEPS)
+    static = np.flatnonzero(errors.kind == 'static')[:MAX_RUNS]
+    time = np.linspace(0.0, REST_RUN_SECONDS, RUN_INSTANTS)
     forces = errors.true['accelerometer'][static]
     gravity = float(np.median(np.linalg.norm(forces, axis=1)))
     uncertainty = Uncertainty(result.calibration)
@@ -137,12 +137,12 @@ def motion_growth(result: CalibrationResult) -> tuple[Growth, ...] | None:
 
     The truth is that of the table, carried to the origin that the calibration compensates to. Noise is included.
     """
-    windows = [w for w in result.gathered.kept if w.time[-1] - w.time[0] >= SHORTEST][:MOST_POSES]
+    windows = [w for w in result.gathered.kept if w.time[-1] - w.time[0] >= MIN_DRAWN_SECONDS][:MAX_RUNS]
     if not windows:
         return None
     length = min(w.time[-1] - w.time[0] for w in windows)
     pairs = [_moving_runs(result, window, length) for window in windows]
-    grid = np.linspace(0.0, length, STEPS)
+    grid = np.linspace(0.0, length, RUN_INSTANTS)
     return tuple(Growth(grid, *(np.array([getattr(pair[k], name) for pair in pairs]) for name in ('velocity', 'position')))
                  for k in range(2))
 
@@ -155,7 +155,7 @@ def _moving_runs(result, window, length):
     reference_c = result.calibration.model.temperature_ref_c
     temperature = np.full(len(time), reference_c) if window.temperature_c is None else window.temperature_c[some]
     corrected = compensate(result.calibration, window.force_s[some], window.rate_s[some], alpha_s=truth.alpha_s, temperature_c=temperature)
-    grid, start = np.linspace(0.0, length, STEPS), truth.mat_sn[0].T
+    grid, start = np.linspace(0.0, length, RUN_INSTANTS), truth.mat_sn[0].T
     true = strapdown(time, truth.force_s, truth.rate_s, gravity=truth.gravity, mat_ns0=start)
     growths = []
     for force, rate in ((window.force_s[some], window.rate_s[some]), (corrected.force, corrected.rate)):

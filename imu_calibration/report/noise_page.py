@@ -8,10 +8,10 @@ from imu_calibration.allan.document import position_budget
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification
 from imu_calibration.allan.processes import FLATNESS, FLICKER, RANDOM_WALK, WHITE
-from imu_calibration.allan.terms import DETERMINED, HELD, WEAK, predicted
-from imu_calibration.core.units import NOISE, for_people
-from imu_calibration.effects.base import SENSORS, UNIT
-from imu_calibration.report.figures import AXIS, FAINT, GREY, MARKER, Drawn, draw, log_axis
+from imu_calibration.allan.terms import TERM_DETERMINED, TERM_HELD, TERM_WEAK, predicted
+from imu_calibration.core.units import NOISE_QUANTITY, for_people
+from imu_calibration.effects.base import SENSORS, UNITS
+from imu_calibration.report.figures import AXIS_COLOURS, FAINT, GREY, MARKER, Drawn, draw, log_axis
 from imu_calibration.report.page import render, text
 
 
@@ -25,14 +25,14 @@ class _Curves:
 
     def __init__(self, result, sensor):
         self.result, self.sensor = result, sensor
-        self.factor, self.unit = for_people(UNIT[sensor], NOISE)
+        self.factor, self.unit = for_people(UNITS[sensor], NOISE_QUANTITY)
 
     def __call__(self, figure):
         axes, tau = figure.subplots(), self.result.record.curve.tau
         log_axis(axes.xaxis)
         log_axis(axes.yaxis)
         first = 3 * SENSORS.index(self.sensor)
-        for k, name in zip(range(first, first + 3), AXIS):
+        for k, name in zip(range(first, first + 3), AXIS_COLOURS):
             self._axis(axes, tau, k, name)
         axes.set_ylim(*self._limits(first))
         self._slopes(axes, tau, max(range(first, first + 3), key=lambda k: self.result.axes[k].terms[WHITE.name].interval[1]))
@@ -42,7 +42,7 @@ class _Curves:
 
     def _axis(self, axes, tau, k, name):
         """Draw one axis: measured, band, model, and the curve with its trends."""
-        curve, colour = self.result.record.curve, AXIS[name]
+        curve, colour = self.result.record.curve, AXIS_COLOURS[name]
         measured, raw = (np.sqrt(values[:, k]) * self.factor for values in (curve.variance, curve.raw))
         model, freedom = predicted(self.result.record.moments[k], self.result.axes[k])
         lower, upper = (measured * np.sqrt(freedom / chdtri(freedom, tail)) for tail in (0.025, 0.975))
@@ -78,7 +78,7 @@ class _Curves:
 
     def _legend(self, axes):
         from matplotlib.lines import Line2D
-        handles = [Line2D([], [], color=colour, marker=MARKER[name], markersize=4, lw=1.3, label=name) for name, colour in AXIS.items()]
+        handles = [Line2D([], [], color=hue, marker=MARKER[name], markersize=4, lw=1.3, label=name) for name, hue in AXIS_COLOURS.items()]
         if any(self.result.record.trends[3 * SENSORS.index(self.sensor) + k] for k in range(3)):
             handles.append(Line2D([], [], color=GREY, ls=':', label='with its trends'))
         axes.legend(handles=handles, loc='upper right', ncols=len(handles))
@@ -91,8 +91,8 @@ RATES = (50.0, 100.0, 200.0, 400.0, 1000.0)
 def noise_report(result: NoiseIdentification, figures: NoiseFigures, horizon: float = HORIZON) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
     found = document.counts(figures)
-    word = 'good' if not found[WEAK] and not found[HELD] else 'weak'
-    headline = f'{found[DETERMINED]} of {sum(found.values())} figures determined'
+    word = 'good' if not found[TERM_WEAK] and not found[TERM_HELD] else 'weak'
+    headline = f'{found[TERM_DETERMINED]} of {sum(found.values())} figures determined'
     first, *rest = document.lines(figures)
     return render('noise.html', title='Noise of an IMU', headline=headline, word=word, first=first, lines=rest, facts=_facts(figures),
                   tiles=_tiles(figures, horizon), tables=_tables(figures),

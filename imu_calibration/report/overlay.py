@@ -8,7 +8,7 @@ import numpy as np
 
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.core.units import STANDARD_GRAVITY, for_people
-from imu_calibration.effects.base import AXES, SENSORS, UNIT
+from imu_calibration.effects.base import AXES, SENSORS, UNITS
 from imu_calibration.report.page import text
 
 MOST_POINTS = 1200
@@ -48,7 +48,7 @@ def overlay_section(traces: Traces, joint_names: Sequence[str], causes: Mapping[
 
 
 def _sensor(traces, sensor, against, first):
-    factor, unit = for_people(UNIT[sensor])
+    factor, unit = for_people(UNITS[sensor])
     rows: list[dict[str, Any]] = []
 
     def row(title: str, chart: Callable[[int], dict[str, Any]], **more: Any) -> None:

@@ -62,8 +62,8 @@ SENSOR_TITLES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope', 're
 USE = {'exact': 'removed by compensation', 'flagged': 'cannot be removed, samples are marked',
        'none': 'belongs to the table or the session, not removed'}
 
-COMMON = 'An error of the gravity used as reference scales all readings. The sds of the other parameters are given without it.'
-WEAK_DATA = 'fixed at its prior: its sd would exceed half of the prior sd'
+COMMON_GRAVITY = 'An error of the gravity used as reference scales all readings. The sds of the other parameters are given without it.'
+HELD_BY_WEAK_DATA = 'fixed at its prior: its sd would exceed half of the prior sd'
 REPLACED = {
     REPLACEMENT: 'fixed at its prior: the estimate is weak and within one sd of it, so that the prior has the smaller expected error',
     LIKELIHOOD_RATIO: 'fixed at its prior, which is not significantly worse than the weak estimate (likelihood ratio)'}
@@ -82,7 +82,7 @@ def parameter_groups(result: CalibrationResult | DiagnosisResult) -> list[dict[s
                        'explanation': effect.explanation, 'use': USE[effect.compensation], 'rows': rows, 'unit': effect.unit_of(0)})
     if common := calibration.common_scale:
         groups.append({'sensor': SENSOR_TITLES['accelerometer'], 'title': 'Common scale', 'name': COMMON_SCALE, 'unit': '1',
-                       'use': 'its value is 1, not removed', 'explanation': COMMON,
+                       'use': 'its value is 1, not removed', 'explanation': COMMON_GRAVITY,
                        'rows': [_row(COMMON_SCALE, 'scale', 1.0, sd=common['sd'], tolerance=common['tolerance'], unit='1',
                                      status=common['status'], why='the local gravity was not given exactly')]})
     return groups
@@ -114,5 +114,5 @@ def _why(calibration, index, share):
     if status == DETERMINED:
         return ''
     if status == HELD:
-        return REPLACED.get(calibration.held_reason.get(name), WEAK_DATA)
+        return REPLACED.get(calibration.held_reason.get(name), HELD_BY_WEAK_DATA)
     return f'estimated, but its sd is {text(share, 2)} times the tolerance'

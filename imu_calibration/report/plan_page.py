@@ -16,25 +16,25 @@ from imu_calibration.kinematics.rotations import align
 from imu_calibration.planning.hand_plan import HandPlan
 from imu_calibration.planning.planner import Plan
 from imu_calibration.planning.repertoire import MotionKind
-from imu_calibration.report.figures import AXIS, FAINT, GREY, INK, Drawn, draw, log_axis
+from imu_calibration.report.figures import AXIS_COLOURS, FAINT, GREY, INK, Drawn, draw, log_axis
 from imu_calibration.report.page import render, text
 
-SIZE = np.array([1.0, 0.7, 0.3])
+HALF_EDGES = np.array([1.0, 0.7, 0.3])
 """Half edges of the box along x, y, z: all different, so that attitudes are distinguishable."""
 VIEW = np.array([[-np.sqrt(0.5), np.sqrt(0.5), 0.0], [-0.35, -0.35, 0.87]])
 """From the level frame to the picture: seen from above one's shoulder."""
-COLUMNS, MOST = 6, 36
+FIGURE_COLUMNS, MAX_ATTITUDES = 6, 36
 
 
 def draw_steps(steps: Sequence[HandStep]) -> str:
     """Return the steps as SVG, numbered in the order of time."""
-    shown = list(steps)[:MOST]
-    rows = max(1, -(-len(shown) // COLUMNS))
+    shown = list(steps)[:MAX_ATTITUDES]
+    rows = max(1, -(-len(shown) // FIGURE_COLUMNS))
     return draw('hand-steps', (8.6, 1.75 * rows), lambda figure: _paint(figure, shown, rows), label='How to hold and to turn the IMU')
 
 
 def _paint(figure, steps, rows):
-    axes = np.atleast_1d(figure.subplots(rows, COLUMNS)).ravel()
+    axes = np.atleast_1d(figure.subplots(rows, FIGURE_COLUMNS)).ravel()
     for place, axis in enumerate(axes):
         axis.set_axis_off()
         if place < len(steps):
@@ -52,11 +52,11 @@ def _box(axis, up):
         normal = sign * np.eye(3)[k]
         if (mat_ns @ normal) @ toward > 0:
             others = [i for i in range(3) if i != k]
-            corners = [normal * SIZE[k] + a * SIZE[others[0]] * np.eye(3)[others[0]] + b * SIZE[others[1]] * np.eye(3)[others[1]]
-                       for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+            edges = np.diag(HALF_EDGES)
+            corners = [sign * edges[k] + a * edges[others[0]] + b * edges[others[1]] for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
             axis.fill(*(VIEW @ mat_ns @ np.array(corners).T), facecolor='#f4f6f9', edgecolor=FAINT, lw=1.0)
-    for k, (name, colour) in enumerate(AXIS.items()):
-        tip = VIEW @ mat_ns @ (np.eye(3)[k] * (SIZE[k] + 0.55))
+    for k, (name, colour) in enumerate(AXIS_COLOURS.items()):
+        tip = VIEW @ mat_ns @ (np.eye(3)[k] * (HALF_EDGES[k] + 0.55))
         axis.annotate('', tip, (0, 0), arrowprops={'arrowstyle': '->', 'color': colour, 'lw': 1.4})
         axis.text(*(1.12 * tip), name, color=colour, fontsize=8, ha='center', va='center')
     axis.annotate('', (-1.55, 1.2), (-1.55, 0.4), arrowprops={'arrowstyle': '->', 'color': GREY, 'lw': 1.0})
@@ -66,7 +66,7 @@ def _box(axis, up):
 KIND = {MotionKind.POSE: '#2b8a57', MotionKind.RETURN: '#7fbf9a', MotionKind.SPIN: '#1f66a8', MotionKind.SWING: '#d08a12',
         MotionKind.TOGETHER: '#8a4fa8', MotionKind.MOVE: '#98a2b0'}
 """Colours of the motions."""
-COLOURS = tuple(AXIS.values()) + ('#8a4fa8', '#d08a12', '#555f6b', '#c0561b', '#1b2430')
+JOINT_COLOURS = tuple(AXIS_COLOURS.values()) + ('#8a4fa8', '#d08a12', '#555f6b', '#c0561b', '#1b2430')
 
 
 def draw_motion(plan: Plan) -> str:
@@ -90,7 +90,7 @@ def _motion(figure, plan):
         values = np.degrees(position[:, k]) if turns[k] else 1000 * position[:, k]
         wrapped = (values + 180.0) % 360.0 - 180.0 if turns[k] else values
         wrapped = np.where(np.abs(np.diff(wrapped, prepend=wrapped[0])) > 180.0, np.nan, wrapped)
-        axes.plot(time, wrapped, color=COLOURS[k % len(COLOURS)], lw=1.2, label=f'{name}, {"deg" if turns[k] else "mm"}')
+        axes.plot(time, wrapped, color=JOINT_COLOURS[k % len(JOINT_COLOURS)], lw=1.2, label=f'{name}, {"deg" if turns[k] else "mm"}')
     top, bottom = axes.get_ylim()[1], axes.get_ylim()[0]
     begins, shown = np.concatenate([[0.0], plan.ends[:-1]]), set()
     for motion, begin, end in zip(plan.motions, begins, plan.ends, strict=True):
@@ -124,7 +124,7 @@ def _fall(axes, time, history, names, *, label):
     shown = set()
     for name, values in zip(names, history.T, strict=True):
         sensor = name.split('.')[0]
-        colour = AXIS['x'] if sensor == SENSORS[0] else AXIS['z']
+        colour = AXIS_COLOURS['x'] if sensor == SENSORS[0] else AXIS_COLOURS['z']
         axes.plot(time, np.maximum(values, 1e-3), color=colour, lw=0.9, alpha=0.6, label=None if sensor in shown else sensor)
         shown.add(sensor)
     axes.plot(time, history.max(axis=1), color=GREY, lw=2.2, label='worst of all')

@@ -7,8 +7,8 @@ import numpy as np
 from imu_calibration.calibration.result import CalibrationResult, WindowErrors
 from imu_calibration.core.units import for_people
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.effects.base import SENSORS, UNIT
-from imu_calibration.report.figures import AXIS, GREY, MARKER, Drawn, axis_legend, draw
+from imu_calibration.effects.base import SENSORS, UNITS
+from imu_calibration.report.figures import AXIS_COLOURS, GREY, MARKER, Drawn, axis_legend, draw
 from imu_calibration.report.page import in_unit, text
 
 LAG_SECONDS = 2.0
@@ -39,7 +39,7 @@ class _Windows:
 
     def __call__(self, figure):
         errors, sensor = self.errors, self.sensor
-        factor, unit = for_people(UNIT[sensor])
+        factor, unit = for_people(UNITS[sensor])
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1, 1.25])
         self._points(upper, errors.before[sensor] * factor, hollow=True)
         floor = 2 * errors.floor[sensor].max(axis=1) * factor
@@ -55,7 +55,7 @@ class _Windows:
         axis_legend(upper, 'lower right', bbox_to_anchor=(0.56, 1.0), borderaxespad=0.1)   # visible on a narrow screen without scrolling
 
     def _points(self, axes, values, hollow=False):
-        for (name, colour), column in zip(AXIS.items(), values.T):
+        for (name, colour), column in zip(AXIS_COLOURS.items(), values.T):
             axes.plot(self.errors.time, column, MARKER[name], color=colour, markersize=3.8, mfc='none' if hollow else colour, mew=0.8,
                       alpha=0.9, label=name)
 
@@ -98,7 +98,7 @@ class _Lags:
         panels = figure.subplots(1, len(self.traces), sharey=True, squeeze=False)[0]
         for axes, (sensor, (lags, values, bound)) in zip(panels, self.traces.items()):
             axes.axhspan(-bound, bound, color='#dfe5ec', lw=0, zorder=0.5)
-            for (name, colour), column in zip(AXIS.items(), values[1:].T):
+            for (name, colour), column in zip(AXIS_COLOURS.items(), values[1:].T):
                 axes.plot(lags[1:], column, color=colour, lw=1.0, marker=MARKER[name], markersize=3, markevery=max(1, len(column) // 12))
             limit = max(0.15, 1.1 * float(np.max(np.abs(values[1:]))))
             axes.set_ylim(-limit, limit)
@@ -112,7 +112,7 @@ def noise_rows(calibration: Calibration) -> list[dict[str, Any]]:
     """Return one row per sensor: noise of a sample, factor at low frequency, scatter between windows, wander."""
     rows = []
     for sensor in SENSORS:
-        found, unit = calibration.statistics.get(sensor, {}), UNIT[sensor]
+        found, unit = calibration.statistics.get(sensor, {}), UNITS[sensor]
         white = np.asarray(found.get('noise_sd', [np.nan] * 3), float)
         wander = found.get('wander_sd') or 0.0
         factor, name = for_people(unit)

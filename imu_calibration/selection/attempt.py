@@ -27,7 +27,7 @@ from imu_calibration.selection.questions import Question, extended_model, time_c
 from imu_calibration.selection.reduced_recording import ReducedRecording, make_bank, mean_arms, reduce_recording
 from imu_calibration.selection.search import FAMILY_WISE, Search
 
-FASTEST = 2 * np.pi * 3.0
+DELAY_FREQUENCY = 2 * np.pi * 3.0
 """Assumed angular frequency of motions in the curvature of a delay, rad/s."""
 TOO_COARSE = 4.0
 """Evidence of a curvature above which the columns are relinearised, nats."""
@@ -223,7 +223,7 @@ def _curvature(question, values, model, duration):
     value = values[list(question.parameters)]
     if effect.warp is not None:
         moved = np.max(np.abs(value - model.point_of(effect)))
-        return moved * {'s': FASTEST, 's/s': FASTEST * duration}.get(effect.unit, 1.0)
+        return moved * {'s': DELAY_FREQUENCY, 's/s': DELAY_FREQUENCY * duration}.get(effect.unit, 1.0)
     if effect.time_constant:
         return abs(np.log(max(value[-1], 1e-3) / model.point_of(effect)[-1]))
     return BILINEAR

@@ -14,11 +14,11 @@ from imu_calibration.estimation.solution import CONVENTION_SHARE
 from imu_calibration.selection.parameter_space import ParameterSpace, white_means, within_of_axis
 from imu_calibration.selection.reduced_recording import Recent
 
-LEAST_WINDOWS = 8
+MIN_FOLD_WINDOWS = 8
 """Least number of windows for held-out folds."""
 MOST_FITS = 128
 """Fits kept with their covariances: a search tries thousands of choices, and asks for the last again."""
-FOLDS = 6
+EVIDENCE_FOLDS = 6
 """Parts that are held out in turn."""
 LEAST_SCATTER = 20
 """Least excess of windows over parameters for a test with their scatter."""
@@ -33,7 +33,7 @@ def locked_windows(kind: np.ndarray) -> np.ndarray:
 
 def folds_of(kind: np.ndarray) -> np.ndarray:
     """Return the fold of each window; windows of each kind are dealt out in turn."""
-    return _turn_of(kind, FOLDS)
+    return _turn_of(kind, EVIDENCE_FOLDS)
 
 
 def _turn_of(kind, modulus):
@@ -241,7 +241,7 @@ def _squares(parts, rows):
 
 DISAGREE = 1e-4
 """Significance level of the test that the halves differ."""
-APART = 1 / 16
+MAX_HALVES_LOSS = 1 / 16
 """
 Share of an effect's chi-square that is lost with one value for both halves, above which they disagree.
 
@@ -253,7 +253,7 @@ def agree(halves: Sequence[tuple[np.ndarray, np.ndarray]], whole: tuple[np.ndarr
     """
     Return whether the estimates of some parameters from two halves agree within their precision.
 
-    They disagree when the difference is significant and one value for both loses more than `APART` of the chi-square.
+    They disagree when the difference is significant and one value for both loses more than `MAX_HALVES_LOSS` of the chi-square.
     A half that hardly determines an effect loses little, for any value: before any rotation, an arm may be estimated at a metre.
 
     Parameters
@@ -269,4 +269,4 @@ def agree(halves: Sequence[tuple[np.ndarray, np.ndarray]], whole: tuple[np.ndarr
     apart = float(difference @ np.linalg.solve((halves[0][1] + halves[1][1])[np.ix_(at, at)], difference))
     value = whole[0][at]
     explained = float(value @ np.linalg.solve(whole[1][np.ix_(at, at)], value))
-    return bool(chi2_sf(apart, len(at)) > DISAGREE or apart < APART * explained)
+    return bool(chi2_sf(apart, len(at)) > DISAGREE or apart < MAX_HALVES_LOSS * explained)

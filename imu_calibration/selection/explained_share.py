@@ -11,9 +11,9 @@ from imu_calibration.selection.parameter_space import scatter_of_each
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Search
 
-LEAST_SHARE = 0.7
+MIN_EXPLAINED_SHARE = 0.7
 """Share of the unexplained that a finding must remove from held-out windows, where a significant rest remains."""
-LEAST_SHARE_SMOOTH = 0.9
+MIN_SMOOTH_SHARE = 0.9
 """The same for an effect that is smooth in time: any smooth curve resembles any other."""
 SHOWS = 0.2
 """An effect counts in a sensor or part where it removes at least this share of its largest removal."""
@@ -135,7 +135,7 @@ def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:
 
 def needed_share(question: Question) -> float:
     """Return the share of the unexplained that a finding of this effect must remove."""
-    return LEAST_SHARE_SMOOTH if question.effect.smooth else LEAST_SHARE
+    return MIN_SMOOTH_SHARE if question.effect.smooth else MIN_EXPLAINED_SHARE
 
 
 def sensors_of(effect: Effect) -> tuple[str, ...]:

@@ -9,19 +9,19 @@ import numpy as np
 from scipy.linalg import svd
 
 from imu_calibration.core.distributions import chi2_sf
-from imu_calibration.effects.base import AXES
+from imu_calibration.effects.base import AXES, TEMPERATURE_RISE
 from imu_calibration.effects.expressions import FUNCTIONS, QUANTITY_OF, array_function, names_in, read
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.selection.residual_blocks import RestBlocks
 from imu_calibration.selection.search import FAMILY_WISE, TIE
 
-ORDERS, PAIR_ORDERS, FEW_ORDERS = range(1, 9), range(1, 7), range(1, 4)
+JOINT_ORDERS, PAIR_ORDERS, FEW_ORDERS = range(1, 9), range(1, 7), range(1, 4)
 """Harmonics per turn: of one joint, of two joints at once, of a joint times another quantity."""
 CONSTANTS = (0.07, 0.2, 0.6)
 """Time constants of settling, as shares of the recording."""
 SOFT_SIGN = 'tanh({} / 0.005)'
 """The sense of a rate changes over 0.3 deg/s: at rest a sign is that of the Earth's rate or of noise, and would shake the bias there."""
-WARMTH = '(temperature_c - temperature_ref_c)'
+TEMPERATURE_FACTOR = f'({TEMPERATURE_RISE})'
 UNIT_OF = {'force': 'm/s^2', 'rate': 'rad/s', 'angular acceleration': 'rad/s^2', 'temperature': 'K', 'joint rate': 'rad/s', 'time': 's'}
 """Quantity -> unit of one factor of it; angles, attitudes and arguments of functions have none."""
 
@@ -126,9 +126,9 @@ def _of_motion() -> Iterator:
 
 
 def _slow(thermal: bool, duration: float) -> Iterator:
-    warm = [(WARMTH, ('temperature',))] if thermal else []
+    warm = [(TEMPERATURE_FACTOR, ('temperature',))] if thermal else []
     settles = [(f'(1 - exp(-time / {share * duration:.3g}))', ()) for share in CONSTANTS] + [('time', ('time',))]
-    yield from ((f'{WARMTH} ** {power}', ('temperature',) * power) for power in (2, 3) if thermal)
+    yield from ((f'{TEMPERATURE_FACTOR} ** {power}', ('temperature',) * power) for power in (2, 3) if thermal)
     for slow in (*warm, *settles):
         yield from (_times(slow, entry) for degree in (1, 2) for entry in _monomials(degree))
         for text, own in _atoms('f', 'w'):
@@ -145,8 +145,8 @@ def _turn(joint, order, before=''):
 
 def _harmonics(n_joints, thermal):
     joints = range(1, n_joints + 1)
-    for joint, order in product(joints, ORDERS):
-        befores = [('', ()), (f'joint_rate_{joint} * ', ('joint rate',))] + [(f'{WARMTH} * ', ('temperature',))] * thermal
+    for joint, order in product(joints, JOINT_ORDERS):
+        befores = [('', ()), (f'joint_rate_{joint} * ', ('joint rate',))] + [(f'{TEMPERATURE_FACTOR} * ', ('temperature',))] * thermal
         if order in FEW_ORDERS:
             befores += [(f'{text} * ', own) for text, own in _atoms('f', 'w')]
         for before, factors in befores:
@@ -171,7 +171,7 @@ def _with_the_table(n_joints, thermal):
     """Yield vectors fixed to the level frame while the sensor turns."""
     joints = range(1, n_joints + 1)
     vectors = [[f'c_{axis}{level}' for axis in AXES] for level in AXES]
-    befores = [('', ())] + [(f'{WARMTH} * ', ('temperature',))] * thermal
+    befores = [('', ())] + [(f'{TEMPERATURE_FACTOR} * ', ('temperature',))] * thermal
     befores += [(f'joint_rate_{joint} * ', ('joint rate',)) for joint in joints]
     for before, factors in befores:
         yield Formula(tuple(tuple(before + text for text in vector) for vector in vectors), factors)
@@ -181,7 +181,7 @@ def _with_the_table(n_joints, thermal):
 
 NEW = 1e-3
 """Least share of a column's size outside the span of the catalogue for a test of it."""
-CHUNK = 128
+COLUMN_CHUNK = 128
 """Columns that are worked out at once."""
 
 
@@ -243,8 +243,8 @@ class FormulaSearch:
         ref, places = self.blocks.ref, _values(self.blocks.ref, reference_temperature)
         means = np.empty((len(self.blocks.time), len(texts)))
         with np.errstate(all='ignore'):
-            for first in range(0, len(texts), CHUNK):
-                worked = _function(texts[first:first + CHUNK])(places)
+            for first in range(0, len(texts), COLUMN_CHUNK):
+                worked = _function(texts[first:first + COLUMN_CHUNK])(places)
                 rows = np.stack([np.broadcast_to(np.asarray(column, float), len(ref)) for column in worked], axis=1)
                 means[:, first:first + len(worked)] = self.blocks.means(rows)
         return np.nan_to_num(means, nan=0.0, posinf=0.0, neginf=0.0)

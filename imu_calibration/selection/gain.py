@@ -8,10 +8,10 @@ import numpy as np
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.questions import Question
 
-RESAMPLES = 1000
+WINDOW_RESAMPLES = 1000
 """Number of resamples of windows for an interval."""
-AT_REST = 'means of windows at rest'
-MEASURES = ('samples', 'window means', 'samples about the mean of their window', AT_REST)
+REST_MEASURE = 'means of windows at rest'
+MEASURES = ('samples', 'window means', 'samples about the mean of their window', REST_MEASURE)
 """Residuals of which a gain is reported."""
 APPLIED, OF_MODEL = 'error of corrected readings', 'residual of the model'
 """Kinds of residuals: of readings as compensation corrects them, relative to the reference, or of raw readings, relative to the model."""
@@ -87,7 +87,7 @@ def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
             pair.append(_squares(attempt.all_samples, values[fold], sensor))
         of = {measure: [squares[measure] for squares in pair] for measure in MEASURES}
         found += [(gain_of(sensor, measure, each), _certainty(each)) for measure, each in of.items()]
-    most = max((told for told, _ in found if told.measure != AT_REST), key=lambda told: told.least)
+    most = max((told for told, _ in found if told.measure != REST_MEASURE), key=lambda told: told.least)
     if most.least > 0:
         return most
     return max(found, key=lambda entry: (not np.isinf(entry[0].least), entry[1]))[0]
@@ -130,7 +130,7 @@ def reduction_interval(pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[f
     n_windows = len(pair[0][0])
     if n_windows < 3:
         return (float('nan'), float('nan'))
-    draw = np.random.default_rng(1).integers(0, n_windows, (RESAMPLES, n_windows))
+    draw = np.random.default_rng(1).integers(0, n_windows, (WINDOW_RESAMPLES, n_windows))
     rms = [np.sqrt(squares[draw].sum(axis=1) / number[draw].sum(axis=1)) for squares, number in pair]
     low, high = np.quantile(1 - rms[1] / rms[0], (0.025, 0.975))
     return (float(low), float(high))

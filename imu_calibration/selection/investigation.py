@@ -12,7 +12,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.evidence import LEAST_WINDOWS
+from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.explained_share import ExplainedWindows, pruned, sensors_of
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.lag_explanations import lag_explanations
@@ -85,7 +85,7 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
 
     """
     used = [window for window in windows if window.kind != 'unused']
-    if len(used) < LEAST_WINDOWS:
+    if len(used) < MIN_FOLD_WINDOWS:
         raise too_few_windows(len(used))
     model = with_joints_of(model, table)
     used, locked, limits = without_clipping(used, table, model)
@@ -225,7 +225,7 @@ def _resolved(attempt, chosen):
 
 def too_few_windows(count: int) -> NotObservableError:
     """Return the error of a recording with so few windows that none can be held out."""
-    return NotObservableError(f'a diagnosis needs at least {LEAST_WINDOWS} windows, so that some can be held out, '
+    return NotObservableError(f'a diagnosis needs at least {MIN_FOLD_WINDOWS} windows, so that some can be held out, '
                               f'{count} were found; rest in more poses, or spin and swing the table',
                               code='too_few_windows')
 

@@ -18,20 +18,20 @@ from imu_calibration.effects.reference_effects import CLOCK, CLOCKS, FAMILY, lag
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.questions import Question, point_with
-from imu_calibration.selection.rivals import SHOWN, Rival, same_questions
+from imu_calibration.selection.rivals import MIN_CURVATURE_NATS, Rival, same_questions
 from imu_calibration.selection.search import PENALTY, TIE
 
-KINDS = (('delay',), ('bandwidth',), ('filter',), ('delay', 'bandwidth'))
+LAG_KINDS = (('delay',), ('bandwidth',), ('filter',), ('delay', 'bandwidth'))
 """Descriptions of one sensor's lag, the simplest first."""
-DELAY = KINDS[0]
+DELAY = LAG_KINDS[0]
 FIRST_SHARE = 0.3
 """Initial share of the low-pass in a lag with a delay: at zero its derivative equals the delay's."""
-COMMON = 0.01
+MAX_CLOCK_LOSS = 0.01
 """
 Without rests: largest loss of a common clock against separate lags, as a share of their log likelihood: noise is estimated from
 the misfit there, and the evidence that separates a motor's ripple from a filter is not reproducible between recordings.
 """
-ROUNDS = 3
+DELAY_LINEARISATIONS = 3
 """Linearisations of a delay with a low-pass."""
 
 
@@ -156,7 +156,7 @@ def simplest(explanations: Sequence[Explanation], silent: float | None = None) -
     if silent is None or len(told.lags) < 2 or CLOCK in told.lags:
         return told
     common = [explanation for explanation in explanations if CLOCK in explanation.lags and len(explanation.lags) == len(told.lags)
-              and explanation.cost < best + TIE + COMMON * (silent - best)]
+              and explanation.cost < best + TIE + MAX_CLOCK_LOSS * (silent - best)]
     return simplest(common) if common else told
 
 
@@ -176,17 +176,17 @@ def _described(attempt, attempted, effects, *, rest, clocks):
 
     first = at(DELAY)
     shown = max(first.attempt.curvature_shows(first.chosen, q) for q in first.chosen if q.name in FAMILY)
-    if shown < SHOWN:
+    if shown < MIN_CURVATURE_NATS:
         return [first]
     first = at(DELAY, first.values)
     found, delays = [first], {sensor: first.lags(sensor)[0][0] for sensor in SENSORS}
-    for kind in KINDS[1:]:
+    for kind in LAG_KINDS[1:]:
         values = dict(first.values)
         for sensor, delay in delays.items():
             own = [delay - FIRST_SHARE * abs(delay), FIRST_SHARE * abs(delay)] if len(kind) == 2 else [delay]
             values |= {effects[lag_name(sensor, ending)].param_names()[0]: value for ending, value in zip(kind, own)}
         told = at(kind, values)
-        for _ in range(ROUNDS - 1 if len(kind) > 1 else 0):
+        for _ in range(DELAY_LINEARISATIONS - 1 if len(kind) > 1 else 0):
             told = at(kind, told.values)
         found.append(told)
     return found

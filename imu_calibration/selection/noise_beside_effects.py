@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.band_misfit import band_misfit, least_misfit, misfit_along
 from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise
-from imu_calibration.estimation.noise_search import NATURAL, TIMES, BiasProcessSearch, NoiseLikelihood
+from imu_calibration.estimation.noise_search import CORRELATION_TIMES, NATURAL, BiasProcessSearch, NoiseLikelihood
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.estimation.session_noise import shaken_means, white_noise
 from imu_calibration.selection.parameter_space import ParameterSpace, normal_matrix, within_matrix
@@ -47,7 +47,7 @@ PLAUSIBLE = 3.0
 """
 A wander of up to this many times the natural one passes for noise; with eight a cable that pulls in an arc, half a milligravity, was one.
 """
-ALIKE, FAR = 3.0, 4.0
+MAX_MIDDLE_RATIO, MAX_WANDER_RATIO = 3.0, 4.0
 """
 So does one of up to this many times that of the middle axis, and of this many times the plausible one at most: the axes of a sensor are
 of one make and their biases wander alike, while a cable pulls along one. Not of the quietest: a bias that steps may rest on one axis.
@@ -56,7 +56,7 @@ STABLE = {'accelerometer': 1e-4, 'gyroscope': 0.0}
 """
 Bias variation that is normal for any white noise, m/s^2 and rad/s: the best accelerometers keep their bias to 10 ug.
 """
-WIDEST = 100.0
+MAX_DRIFT_RATIO = 100.0
 """
 Largest drift over the usual bias variation: the ratio by which the effects' priors, for consumer instruments, exceed their bias
 variation.
@@ -93,7 +93,7 @@ def noise_beside_effects(space: ParameterSpace, smooth: dict[str, list[tuple[int
 
 def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ...]:
     """Return the least bias processes: the known ones, else from the white noise of the sensor and the time between samples, s."""
-    return noise.known or (BiasProcess(NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), TIMES[0]),)
+    return noise.known or (BiasProcess(NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), CORRELATION_TIMES[0]),)
 
 
 def plausible_processes(noise: NoiseModel, period: float, *, sensor: str, duration: float) -> tuple[BiasProcess, ...]:
@@ -107,8 +107,8 @@ def plausible_processes(noise: NoiseModel, period: float, *, sensor: str, durati
         return natural
     seen = float(np.sqrt(sum(process.within(duration)**2 for process in noise.bias_processes)))
     most = PLAUSIBLE * max(natural[0].sd, STABLE[sensor])
-    alike = ALIKE * noise.middle_wander * seen / float(np.sqrt(noise.bias_variance))
-    share = min(1.0, float(np.clip(alike, most, FAR * most)) / seen)
+    alike = MAX_MIDDLE_RATIO * noise.middle_wander * seen / float(np.sqrt(noise.bias_variance))
+    share = min(1.0, float(np.clip(alike, most, MAX_WANDER_RATIO * most)) / seen)
     return tuple(replace(process, sd=share * process.sd) for process in noise.bias_processes)
 
 
@@ -192,7 +192,7 @@ def drift_prior(columns: np.ndarray, prior_sd: np.ndarray, usual: float) -> np.n
 
     """
     spread = np.sqrt(columns.var(axis=0).max(axis=0))
-    return np.minimum(prior_sd, WIDEST * usual / np.maximum(spread, 1e-300))
+    return np.minimum(prior_sd, MAX_DRIFT_RATIO * usual / np.maximum(spread, 1e-300))
 
 
 def _needed_smooth(search, structural, options, *, prior_sd):

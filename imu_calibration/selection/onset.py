@@ -9,13 +9,13 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.evidence import LEAST_WINDOWS
-from imu_calibration.selection.explained_share import LEAST_SHARE, SIGNIFICANT_REST, ExplainedWindows
+from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
+from imu_calibration.selection.explained_share import MIN_EXPLAINED_SHARE, SIGNIFICANT_REST, ExplainedWindows
 from imu_calibration.selection.parameter_space import matrix_of_each
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_blocks import residuals
 
-MARGIN = LEAST_WINDOWS + 1
+MIN_ONSET_WINDOWS = MIN_FOLD_WINDOWS + 1
 """Least number of moving windows before and after an onset: the longer part, without the window of the onset, can be searched."""
 SUDDEN = 0.5
 """Largest share of the excess of a linear change in time that an onset may have: above it the change may be gradual."""
@@ -59,8 +59,9 @@ def find_onset(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Q
     Return the Onset that explains the residual of a choice, None without one.
 
     For each group of parameters and each moment between two windows, the model ``columns @ values + after * columns[:, group] @ change`` is
-    fitted with the noise at rest. The onset must remove `LEAST_SHARE` of the excess, and its excess must be at most half that of a linear
-    change of the same parameters with time. The moment is then refined to the sample at which the residuals of both states are least.
+    fitted with the noise at rest. The onset must remove `MIN_EXPLAINED_SHARE` of the excess, and its excess must be at most half that of a
+    linear change of the same parameters with time. The moment is then refined to the sample at which the residuals of both states are
+    least.
     """
     used, space, groups = attempt.search.used(chosen), attempt.evidence.space, _groups(attempt.recording.model)
     every = np.array(list(dict.fromkeys([*used, *(k for group in groups.values() for k in group)])))
@@ -69,7 +70,7 @@ def find_onset(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Q
     total, count = each.sum(axis=0), explained.n_means + explained.n_within
     base, noise = np.arange(len(used)), SIGNIFICANT_REST * np.sqrt(2 * count)
     moving = np.cumsum(space.recording.moving)
-    allowed = np.flatnonzero((moving >= MARGIN) & (moving[-1] - moving >= MARGIN))
+    allowed = np.flatnonzero((moving >= MIN_ONSET_WINDOWS) & (moving[-1] - moving >= MIN_ONSET_WINDOWS))
     single = _fit(total, base, small)[0] - count
     if single < noise or not len(allowed):
         return None
@@ -83,7 +84,7 @@ def find_onset(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Q
         losses = np.array([loss for loss, *_ in fits])
         best, likely = int(np.argmin(losses)), allowed[losses < losses.min() + LIKELY]
         excess, gradual = fits[best][0] - count, _fit(total, own, small, (slope, curve, at))[0] - count
-        if excess < (1 - LEAST_SHARE) * single and excess < SUDDEN * gradual:
+        if excess < (1 - MIN_EXPLAINED_SHARE) * single and excess < SUDDEN * gradual:
             found.append((len(group), excess, name, likely[[0, -1]] + (0, 1), group, every[own], fits[best][1:]))
     if not found:
         return None

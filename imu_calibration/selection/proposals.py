@@ -5,16 +5,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.core.units import for_people, with_sd
-from imu_calibration.effects.base import AXES, SENSORS, SHORT, Effect
+from imu_calibration.effects.base import AXES, PREFIXES, SENSORS, Effect
 from imu_calibration.effects.catalogue import term
 from imu_calibration.estimation.observability import MOTIONS, TABLE_MOTIONS
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.explained_share import LEAST_SHARE_SMOOTH
+from imu_calibration.selection.explained_share import MIN_SMOOTH_SHARE
 from imu_calibration.selection.formulas import Formula, FormulaChoice, FormulaSearch, grammar
 from imu_calibration.selection.residual_blocks import RestBlocks
 from imu_calibration.selection.residual_fit import BlockFit, BlockFits, share_interval, share_removed
 
-LEAST_SHARE = 0.6
+MIN_FORMULA_SHARE = 0.6
 """Share of the excess that a formula removes from held-out windows at least."""
 WORTH_A_SECOND = 0.1
 """Share that a second formula adds at least."""
@@ -81,7 +81,7 @@ class Proposal:
         if self.nearest is not None:
             text += (f'; it is not in the catalogue: {self.nearest[0]}, the closest effect, '
                      f'would remove {100 * max(self.nearest[1], 0.0):.0f} %')
-            text += ' here, but the remaining axes or sensor contradict it' * (self.nearest[1] > LEAST_SHARE)
+            text += ' here, but the remaining axes or sensor contradict it' * (self.nearest[1] > MIN_FORMULA_SHARE)
         if self.alike:
             text += f'; collinear in this recording: {" or ".join(self.alike)}'
         return text
@@ -120,7 +120,7 @@ def propose(blocks: RestBlocks, attempt: Attempt, fits: BlockFits) -> Proposal |
             break
         choices, share = [*choices, found], grown
         search.take(found)
-    needed = LEAST_SHARE_SMOOTH if any(choice.formula.smooth for choice in choices) else LEAST_SHARE
+    needed = MIN_SMOOTH_SHARE if any(choice.formula.smooth for choice in choices) else MIN_FORMULA_SHARE
     if not choices or share < needed:
         return None
     return _told(blocks, attempt, fits, plain, choices)
@@ -217,7 +217,7 @@ def _taken(attempt):
 def _effect(sensor, number, text, formula, values, taken):
     unit = formula.unit('m/s^2' if sensor == SENSORS[0] else 'rad/s')
     largest = float(np.abs(values).max())
-    names = (f'{SHORT[sensor]}_proposed_{k}' for k in range(1, 100))
+    names = (f'{PREFIXES[sensor]}_proposed_{k}' for k in range(1, 100))
     free = [name for name in names if name not in taken][number]
     return term(free, sensor=sensor, column=text if isinstance(text, str) else list(text), unit=unit, tolerance=_digits(0.1 * largest),
                 tolerance_reason='a tenth of the estimate', prior_sd=_digits(10 * largest), largest=_digits(3 * largest),

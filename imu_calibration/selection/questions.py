@@ -20,8 +20,8 @@ TEMPERATURE_SPAN = 1.0
 """Least span of temperature that can show a thermal effect, K."""
 BRANCHES_APART = 1.5
 """Least span of the thermal branch, from -1 to 1, that separates cooling from warming up."""
-SHAKEN, LEAST_SHAKEN = VIBRATES, 3
-"""A rest has vibration if its noise has this many times the variance of the quietest; least number of such rests."""
+SHAKEN_RESTS = 3
+"""Least number of rests whose noise has `VIBRATES` times the variance of the quietest."""
 N_TIME_CONSTANTS = 12
 """Number of time constants in the bank of warm-ups."""
 
@@ -107,12 +107,12 @@ def _vibrates(windows):
     """Return whether vibration differs between rests."""
     rests = [window for window in windows if window.kind == 'static' and len(window) > 3]
     variances = np.array([max(window.noise_sd[0] @ window.noise_sd[0], least_variance(window.force_s)) for window in rests])
-    return np.count_nonzero(variances > SHAKEN * variances.min(initial=np.inf)) >= LEAST_SHAKEN
+    return np.count_nonzero(variances > VIBRATES * variances.min(initial=np.inf)) >= SHAKEN_RESTS
 
 
 def _not_shaken(effect, shaken):
     if 'vibration' in effect.needs and not shaken:
-        return 'it did not vibrate now more, now less at rest', f'record {LEAST_SHAKEN} rests and more while a machine on the table runs'
+        return 'it did not vibrate now more, now less at rest', f'record {SHAKEN_RESTS} rests and more while a machine on the table runs'
     return None
 
 
@@ -167,7 +167,7 @@ def special(effect: Effect) -> bool:
     return effect.role is Role.LIMIT or effect.timed
 
 
-PASSES = 6
+MAX_TABLE_PASSES = 6
 """Most passes over a recording with repeated linearisation."""
 STARTS = 6
 """Number of start values of the time constant, with a ratio of 2.3: the iteration converges from a start within this factor."""

@@ -42,7 +42,7 @@ class Recent(dict):
             del self[next(iter(self))]
 
 
-WIDE = 10.0
+BANK_PRIOR_RATIO = 10.0
 """
 Standard deviations of amplitudes in a bank, times the effect's own: neighbours share one curve with opposite signs, and where the prior
 constrained them the estimated noise changed; from a factor of six on it does not.
@@ -74,7 +74,7 @@ class BankEntry:
     @property
     def prior_sd(self) -> np.ndarray:
         """Standard deviations of the amplitudes before any data."""
-        return WIDE * self.effect.amplitudes(self.effect.prior_sds())
+        return BANK_PRIOR_RATIO * self.effect.amplitudes(self.effect.prior_sds())
 
     def columns(self, ref: Reference) -> np.ndarray:
         """Return the columns that the amplitudes multiply, shape (n, n_columns)."""
@@ -104,7 +104,7 @@ PARTS = ('within', 'slow')
 """Triangular factors of a window: of all centred rows, and of the means of short pieces."""
 REDUCING = 'reducing the recording'
 """Phase of the progress."""
-BATCH = 32
+UNPACKED_WINDOWS = 32
 """Windows whose factors are unpacked at a time."""
 MOST_SUMS = 32
 """Sums of products kept: the folds of every kind of window, for the next axis."""
@@ -197,8 +197,8 @@ class ReducedRecording:
 
         """
         chosen = np.flatnonzero(rows & self.moving)
-        for at in range(0, len(chosen), BATCH):
-            some = chosen[at:at + BATCH]
+        for at in range(0, len(chosen), UNPACKED_WINDOWS):
+            some = chosen[at:at + UNPACKED_WINDOWS]
             yield some, self._with_residual(sensor, unpacked([self.factors[sensor, part][k] for k in some]))
 
     def product_sum(self, sensor: str, part: str, rows: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from imu_calibration.selection.residual_blocks import RestBlocks, block_means
 FEWEST = 6
 """Blocks that a regime holds at least."""
 N_BINS = 24
-ORDER = 3
+SMOOTH_ORDER = 3
 """Order of smooth functions of a variable."""
 MOST_BOUNDS = 16
 """Places at which a range is tried to begin, and to end, about the edge of a bin."""
@@ -55,10 +55,10 @@ class Variable:
         if not len(self.edges):
             return np.zeros((len(self.starts), 0))
         if self.cyclic:
-            turns = np.arange(1, ORDER + 1) * (self.values * DEG)[:, None]
+            turns = np.arange(1, SMOOTH_ORDER + 1) * (self.values * DEG)[:, None]
             return block_means(np.concatenate([np.cos(turns), np.sin(turns)], axis=1), self.starts)
         low, high = self.values.min(), self.values.max()
-        return block_means(np.polynomial.legendre.legvander(2 * (self.values - low) / (high - low) - 1, ORDER)[:, 1:], self.starts)
+        return block_means(np.polynomial.legendre.legvander(2 * (self.values - low) / (high - low) - 1, SMOOTH_ORDER)[:, 1:], self.starts)
 
     def chosen(self, member: np.ndarray) -> list[int]:
         """Return the bins of a range, in order."""

@@ -12,7 +12,7 @@ from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.regime_variables import FEWEST, Variable, variables_of
 from imu_calibration.selection.residual_blocks import RestBlocks
 
-BY_CHANCE = 0.05
+REGIME_LEVEL = 0.05
 """Probability that a recording without a place has one reported, for all axes of a sensor together."""
 PERMUTED = 199
 """Random exchanges of the residual between windows."""
@@ -22,19 +22,19 @@ MOST_OF_IT = 0.8
 """Least share of the excess that an offset in a regime removes, or that lies in a regime of larger scatter."""
 NEARLY_ALL = 0.95
 """Share of the scatter of a range in its reported part."""
-ALIKE = 0.01
+REGIME_SHARE_TIE = 0.01
 """Difference of the shares of two regimes up to which the order of variables decides: joints before the sensor."""
 SURE = 16.0
 """Least advantage of a regime over a smooth curve or a formula, twice the difference of log likelihood, nats."""
 LOUDER = 1.5
 """Least ratio of the variances inside and outside of a regime of larger scatter."""
-WIDEST = 0.6
+MAX_REGIME_SHARE = 0.6
 """Largest share of the blocks in a regime; a larger one does not localise the residual."""
 REPORTED = 4
 """Variables whose likeliest range is described, at most."""
 SCORINGS = 12
 """Steps of the fit of a variance that is a smooth function of a variable."""
-LARGEST = 1e3
+MAX_VARIANCE_RATIO = 1e3
 """Largest ratio of a square and its variance in a step, which limits the influence of few residuals."""
 TINY = 1e-9
 """Keeps columns that a part of the recording does not have from making a system singular."""
@@ -92,7 +92,7 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
 
     """
     exchange = exchanges(blocks.window, attempt.recording.kind[blocks.window], np.linalg.norm(blocks.means(blocks.ref.rate_s), axis=1))
-    search, level = RegimeSearch(blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange), BY_CHANCE / len(AXES)
+    search, level = RegimeSearch(blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange), REGIME_LEVEL / len(AXES)
     white, found = None, []
     for axis, name in enumerate(AXES):
         offsets = []
@@ -214,7 +214,7 @@ class RegimeSearch:
         for variable in variables:
             marks, member = variable.marks, variable.ranges
             inside = member @ marks.sum(axis=0)
-            allowed = (inside >= min(FEWEST, len(marks) / 8)) & (inside <= WIDEST * len(marks))
+            allowed = (inside >= min(FEWEST, len(marks) / 8)) & (inside <= MAX_REGIME_SHARE * len(marks))
             if allowed.any():
                 self._ranges.append(_Ranges(variable, marks, member[allowed]))
 
@@ -334,7 +334,7 @@ class RegimeSearch:
 
 def _largest_share_first(found):
     """Return regimes in order of their shares; among nearly equal ones the order is kept."""
-    alike = max((regime.share for regime in found), default=0.0) - ALIKE
+    alike = max((regime.share for regime in found), default=0.0) - REGIME_SHARE_TIE
     return sorted(found, key=lambda regime: -min(regime.share, alike))
 
 
@@ -362,7 +362,7 @@ def _smooth_scatter(columns, variance, weight):
     design, root = np.column_stack([np.ones(len(columns)), columns]), np.sqrt(weight)
     values = np.zeros(design.shape[1])
     for _ in range(SCORINGS):
-        ratio = np.minimum(variance * np.exp(-np.maximum(design @ values, 0.0)), LARGEST)
+        ratio = np.minimum(variance * np.exp(-np.maximum(design @ values, 0.0)), MAX_VARIANCE_RATIO)
         values = values + np.linalg.lstsq(root[:, None] * design, root * (ratio - 1.0), rcond=1e-9)[0]
     logs = np.maximum(design @ values, 0.0)
     ratio = variance * np.exp(-logs)

@@ -19,7 +19,7 @@ from imu_calibration.selection.residual_blocks import RestBlocks, rest_blocks
 from imu_calibration.selection.residual_fit import BlockFits
 from imu_calibration.selection.unexplained import Unexplained, unexplained
 
-CLEAR = 10.0
+MIN_FORMULA_SDS = 10.0
 """Standard deviations above noise at rest from which a formula is searched in moving blocks."""
 NOT_NEEDED = 0.05
 """Least share of a finding's reduction of the residual that must remain with a formula or a regime in the model."""
@@ -71,7 +71,7 @@ class Examination(Investigation):
         """
         if sensor not in self._proposals:
             fits = self.fits(sensor)
-            clear = self.rests[sensor].significant or fits.sigma > CLEAR
+            clear = self.rests[sensor].significant or fits.sigma > MIN_FORMULA_SDS
             self._proposals[sensor] = propose(self.blocks[sensor], self.attempt, fits) if clear else None
         return self._proposals[sensor]
 

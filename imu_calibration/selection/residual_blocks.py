@@ -20,9 +20,9 @@ from imu_calibration.selection.noise_beside_effects import natural_processes
 from imu_calibration.selection.questions import TEMPERATURE_SPAN
 from imu_calibration.simulation.session import predict_windows
 
-BLOCK = 0.25
+MIN_BLOCK_SECONDS = 0.25
 """Least length of a block of a moving window, s; at rest a window is one block."""
-MOST_BLOCKS = 1200
+MAX_RESIDUAL_BLOCKS = 1200
 """Blocks of one recording, about: their full covariance is factored."""
 AT_A_TIME = 256
 """Blocks whose columns are in memory at once."""
@@ -107,7 +107,7 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
         Expected loss from noise.
 
     """
-    length = max(BLOCK, sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1) / MOST_BLOCKS)
+    length = max(MIN_BLOCK_SECONDS, sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1) / MAX_RESIDUAL_BLOCKS)
     which = _some(windows, length)
     windows = [windows[k] for k in which]
     parts = [_cut(window, length) for window in windows]
@@ -152,9 +152,9 @@ def _roughness(residual, windows, edges, least):
 def _some(windows, length):
     """Return the numbers of the windows in use: all, or a random part of a long recording, in order."""
     blocks = sum(1 if len(w.motion) == 1 else max(1, round((w.time[-1] - w.time[0]) / length)) for w in windows)
-    if blocks <= 2 * MOST_BLOCKS:
+    if blocks <= 2 * MAX_RESIDUAL_BLOCKS:
         return np.arange(len(windows))
-    return np.sort(np.random.default_rng(0).permutation(len(windows))[:len(windows) * 2 * MOST_BLOCKS // blocks])
+    return np.sort(np.random.default_rng(0).permutation(len(windows))[:len(windows) * 2 * MAX_RESIDUAL_BLOCKS // blocks])
 
 
 def _busier(windows, sensor, floor, kinds, judged):

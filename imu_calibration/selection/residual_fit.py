@@ -9,9 +9,9 @@ from imu_calibration.effects.base import AXES
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.selection.residual_blocks import RestBlocks
 
-WIDE = 1e6
+AMPLITUDE_PRIOR_SD = 1e6
 """Prior sd of amplitudes; unit: the amplitude that equals one standard deviation of noise in all blocks."""
-RESAMPLES = 500
+SHARE_RESAMPLES = 500
 LEAST_OF_AXIS = 0.1
 """Share of the strongest axis' squares from which another axis has an excess too."""
 ABOVE_NOISE = 3.0
@@ -69,7 +69,7 @@ class BlockFits:
                 chosen = chosen[(time > np.median(time)) == half]
             scale = np.sqrt(np.maximum((chosen[:, len(at):-1]**2).sum(axis=0), 1e-60))
             own = self.blocks.index[axis][at]
-            sd, mean = np.append(self._prior[0][own], WIDE / scale), np.append(self._prior[1][own], np.zeros(count))
+            sd, mean = np.append(self._prior[0][own], AMPLITUDE_PRIOR_SD / scale), np.append(self._prior[1][own], np.zeros(count))
             values, covariance = solve_normal(chosen.T @ chosen, np.arange(len(sd)), sd, prior_mean=mean)
             left = chosen[:, -1] - chosen[:, :-1] @ values
             misfit = max(float(left @ left) / max(len(left) - len(values), 1), 1.0)
@@ -116,7 +116,7 @@ def share_interval(before: BlockFit, after: BlockFit, rng: np.random.Generator) 
     """Return the 95 % interval of `share_removed`, by resampling locked windows."""
     windows = np.unique(before.window)
     sums = np.array([[(fit.rest[before.window == w]**2 - 1.0).sum() for w in windows] for fit in (before, after)])
-    drawn = sums[:, rng.integers(len(windows), size=(RESAMPLES, len(windows)))].sum(axis=2)
+    drawn = sums[:, rng.integers(len(windows), size=(SHARE_RESAMPLES, len(windows)))].sum(axis=2)
     shares = 1.0 - np.maximum(drawn[1], 0.0) / np.maximum(drawn[0], 1e-300)
     low, high = np.quantile(shares, (0.025, 0.975))
     return float(low), float(high)

@@ -17,7 +17,7 @@ from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import PENALTY, TIE, Search
 
-SHOWN = 0.1
+MIN_CURVATURE_NATS = 0.1
 """Evidence of a curvature below which it does not separate effects, nats: a delay of 0.1 ms is a lag of 0.1 ms."""
 
 
@@ -90,7 +90,7 @@ def same_questions(attempt: Attempt, chosen: Sequence[Question]) -> list[Questio
 def _swapped(attempt, chosen):
     """Return the choices with an effect replaced by one that only curvature separates from it, where the curvature is observable."""
     return [[other if each is question else each for each in chosen] for question in chosen
-            if question.effect.warp is not None and attempt.curvature_shows(chosen, question) > SHOWN
+            if question.effect.warp is not None and attempt.curvature_shows(chosen, question) > MIN_CURVATURE_NATS
             for other, _ in attempt.search.class_mates(chosen, question, most=None) if other.effect.warp is not None]
 
 
@@ -141,7 +141,7 @@ def _fewer(search, kept, question):
     return sorted((score.question for score in scores if score.significant and score.gain >= enough), key=lambda other: other.penalty)
 
 
-UNIQUE = 0.05
+MIN_UNIQUE_SHARE = 0.05
 """Least share of the signal of each member that the other cannot imitate."""
 TRIED = 3
 """Pairs from which a search is started."""
@@ -208,5 +208,5 @@ class _Blocks:
         shared = [np.einsum('kij,ki->kj', cross, parts[0]), np.einsum('kij,kj->ki', cross, parts[1])]
         for k, (one, two) in enumerate(pairs):
             unique = [1 - (other[k] @ other[k]) / max(part[k] @ part[k], 1e-300) for part, other in zip(parts, shared)]
-            if min(unique) > UNIQUE:
+            if min(unique) > MIN_UNIQUE_SHARE:
                 yield 0.5 * fall[k] - PENALTY * sum(self.questions[q].penalty for q in (one, two)), one, two

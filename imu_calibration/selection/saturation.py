@@ -13,17 +13,17 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.estimation.window_statistics import joined_motion
 from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.full_scale import MIN_CLIPPED_SAMPLES
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.selection.evidence import LEAST_WINDOWS, locked_windows
+from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS, locked_windows
 
-MARGIN = 4.0
+CLIP_MARGIN_SDS = 4.0
 """Samples predicted within this many standard deviations of the limit are left out: noise decides whether they are clipped."""
 AGREEMENT = 0.25
 """Least sum of the probabilities of exceeding the limit over clipped samples, as a share of its expectation for clipping by noise.
 
 Near one g at rest only the tails of the noise are cut: a correct limit then has a probability of a tenth for each sample."""
-LEAST_CLIPPED = 4
-SHORTEST = 20
+MIN_LEFT_SAMPLES = 20
 """A window with fewer samples left is dropped."""
 
 
@@ -107,7 +107,7 @@ def may_be_clipped(windows: Sequence[Window], sensor: str) -> bool:
     size = np.concatenate([np.abs(measured(w, sensor)).ravel() for w in windows])
     level = size.max(initial=0.0)
     at = int((size >= level * (1 - 1e-12)).sum())
-    if at < LEAST_CLIPPED or level == 0:
+    if at < MIN_CLIPPED_SAMPLES or level == 0:
         return False
     # A coarse output repeats all its values, most of all the step at gravity; the values just below the largest show how often.
     _, repeats = np.unique(size[(size < level * (1 - 1e-12)) & (size > 0.9 * level)], return_counts=True)
@@ -135,7 +135,7 @@ def find_saturation(windows: Sequence[Window], predicted: list, noise_sd: np.nda
     clipped = np.abs(output) >= level * (1 - 1e-12)
     beyond = norm_sf((level - np.abs(expected)) / noise_sd)
     n_expected = float(beyond.sum())
-    if n_expected < LEAST_CLIPPED or beyond[clipped].sum() < AGREEMENT * clipped.sum() * (beyond**2).sum() / n_expected:
+    if n_expected < MIN_CLIPPED_SAMPLES or beyond[clipped].sum() < AGREEMENT * clipped.sum() * (beyond**2).sum() / n_expected:
         return None
     far = np.abs(expected) > level
     before, after = output - expected, output - np.clip(expected, -level, level)
@@ -160,12 +160,12 @@ def without_clipped(windows: Sequence[Window], predicted: list, levels: dict[str
     for window, pair in zip(windows, predicted):
         good = np.ones(len(window.time), bool)
         for sensor, level in levels.items():
-            near = np.abs(pair[SENSORS.index(sensor)]) > level - MARGIN * noise_sd[sensor]
+            near = np.abs(pair[SENSORS.index(sensor)]) > level - CLIP_MARGIN_SDS * noise_sd[sensor]
             at = np.abs(measured(window, sensor)) >= level * (1 - 1e-12)
             good &= ~(near | at).any(axis=1)
         if good.all():
             kept.append(window)
-        elif window.kind != 'static' and good.sum() >= SHORTEST:
+        elif window.kind != 'static' and good.sum() >= MIN_LEFT_SAMPLES:
             kept.append(_selected(window, good))
     return kept
 
@@ -223,7 +223,7 @@ def _limits(windows, table, model):
     for _ in range(2):
         predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))
         kept = without_clipped(windows, predicted, limits, noise_sd=noise_sd)
-        if len(kept) < LEAST_WINDOWS:
+        if len(kept) < MIN_FOLD_WINDOWS:
             return nothing   # output that is always at or near its limit does not determine it
     values = simple_fit(kept, table, model)
     predicted = predictions(windows, table, model, values=values)

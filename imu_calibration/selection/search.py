@@ -15,11 +15,11 @@ from imu_calibration.selection.questions import Question
 
 FAMILY_WISE = 0.001
 """Probability of a finding in a recording with a correct model."""
-LEAST_GAIN = 4.0
+MIN_GAIN_NATS = 4.0
 """Least gain of held-out log likelihood, nats."""
 PENALTY = 1.0
 """Penalty for a parameter in addition to that of held-out prediction, nats."""
-BETTER = 0.01
+MIN_REPLACEMENT_NATS = 0.01
 """Least fall of the held-out cost for which an effect is replaced, nats: two lags are a delay, and less than this is rounding."""
 TIE = 8.0
 """Difference of held-out log likelihood up to which effects are not separable by the recording, nats."""
@@ -54,7 +54,7 @@ class Score:
     @property
     def significant(self) -> bool:
         """Return whether the effect may be named."""
-        return self.allowed and self.p_value < FAMILY_WISE and self.net > 0 and self.gain > LEAST_GAIN
+        return self.allowed and self.p_value < FAMILY_WISE and self.net > 0 and self.gain > MIN_GAIN_NATS
 
 
 class Search:
@@ -154,7 +154,7 @@ class Search:
             return True
         rest = [q for q in chosen if q is not question]
         before, after = (self.evidence.heldout_parts(self.used(some)) for some in (rest, chosen))
-        return all((after[sensor] - before[sensor]).sum() < 2 * LEAST_GAIN for sensor in question.effect.acts_on)
+        return all((after[sensor] - before[sensor]).sum() < 2 * MIN_GAIN_NATS for sensor in question.effect.acts_on)
 
     def run(self, start: Sequence[Question] = ()) -> Sequence[Question]:
         """Return the chosen questions in the order in which they were found, from none or from a first choice."""
@@ -194,7 +194,7 @@ class Search:
         return None
 
     def _replaced(self, chosen):
-        best, cost = None, self.cost(chosen) - BETTER
+        best, cost = None, self.cost(chosen) - MIN_REPLACEMENT_NATS
         for place, question in enumerate(chosen):
             if question.name in self.resolved:   # it could not be added again, and an effect that cancels it may be in the model
                 continue

@@ -14,19 +14,19 @@ from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.proposals import Proposal
 from imu_calibration.selection.residual_blocks import residuals
 
-LOWEST, HIGHEST_ORDER = 4, 64
+LOWEST_ORDER, HIGHEST_ORDER = 4, 64
 """Orders under test; lower ones are formulas."""
 PIECE_S = 2.0
 """Length of the pieces for comparison of phases, s."""
 CYCLES_OF_ORDER = 1.5
 """Of an order in a piece that can show it: less is a slope or a curve."""
-LEAST_PIECES = 8
+MIN_SPECTRUM_PIECES = 8
 """Least number of pieces for an estimate of the scatter."""
 OUT = 10.0
 """Least power of an order over the median of all orders; residuals that repeat with the motion have all orders."""
 IN_PHASE = 0.5
 """Cosine of the angle within which a window is in phase."""
-MOST = 0.75
+MIN_ORDER_SHARE = 0.75
 """Share of the windows that must be, more than."""
 SHORTEST_CYCLE = 2.2
 """Samples per cycle, at least."""
@@ -68,13 +68,13 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     joint : int
 
     """
-    order = np.arange(LOWEST, HIGHEST_ORDER + 1)
+    order = np.arange(LOWEST_ORDER, HIGHEST_ORDER + 1)
     pieces = [(number, *_projected(rest, time, angle, order)) for number, rest, time, angle in _pieces(windows, rests, joint)]
     if not pieces:
         return None
     number, sums, weight = (np.stack(part) for part in zip(*pieces))   # (p,), (p, k, 3), (p, k)
     seen = weight > 0
-    enough = seen.sum(axis=0) >= LEAST_PIECES
+    enough = seen.sum(axis=0) >= MIN_SPECTRUM_PIECES
     if not enough.any():
         return None
     order, sums, weight, count = order[enough], sums[:, enough], weight[:, enough], seen.sum(axis=0)[enough]
@@ -132,24 +132,24 @@ def _projected(rest, time, angle, order):
     return sums, weight
 
 
-STEP = 0.1
+FREQUENCY_STEP = 0.1
 """Spacing of the frequencies under test, cycles per second or per turn; its inverse is the largest length of a stretch."""
-PER_TURN = 128
+ANGLES_PER_TURN = 128
 """Angles per turn at which the residual of a turning joint is sampled."""
 CYCLES_OF_TONE = 3.0
 """Of a tone in a stretch that can show it."""
-HIGHEST = 0.45
+MAX_FREQUENCY_SHARE = 0.45
 """Highest frequency in that of the samples."""
-CLEAR, BY_CHANCE = 4.0, 0.05
+MIN_LINE_POWER, LINE_CHANCE = 4.0, 0.05
 """
 Least power over its surroundings in a stretch, and its probability by noise: e^-4, and more where few frequencies determine the
 surroundings.
 """
-SIGNIFICANT = 1e-4
+TONE_P_VALUE = 1e-4
 """Probability of a tone by noise, times the number of frequencies, axes and joints."""
 MOSTLY = 0.5
 """Least share of the stretches with the tone; effects of the motion occur in some of them only."""
-SLOWEST = 1.0 * DEG
+MIN_ORDER_RATE = 1.0 * DEG
 """A joint that turns slower at times has no orders, rad/s."""
 
 
@@ -227,7 +227,7 @@ def find_tones(found: Investigation, table: Table, formulas: Sequence[Proposal] 
 def _significant(tones, tests):
     """Return (axis, joint) -> the most significant tone, its p-value times the number of tests and axes."""
     told, first = [replace(tone, p_value=tone.p_value * len(AXES) * tests) for tone in tones], {}
-    for tone in sorted((tone for tone in told if tone.p_value < SIGNIFICANT), key=lambda tone: tone.p_value):
+    for tone in sorted((tone for tone in told if tone.p_value < TONE_P_VALUE), key=lambda tone: tone.p_value):
         first.setdefault((tone.axis, tone.joint), tone)
     return first
 
@@ -245,7 +245,7 @@ def _whole(sensor, windows, parts, joint, name) -> Iterator[Tone]:
     if orders is None:
         return
     for axis in range(3):
-        out = (orders.power[:, axis] > OUT) & (orders.share[:, axis] > MOST)
+        out = (orders.power[:, axis] > OUT) & (orders.share[:, axis] > MIN_ORDER_SHARE)
         if out.any():
             best = int(np.argmin(np.where(out, orders.p_value[:, axis], np.inf)))
             yield Tone(sensor, AXES[axis], name, float(orders.order[best]), float(orders.amplitude[best, axis]),
@@ -259,20 +259,21 @@ def _stretches(windows: Sequence[Window], parts: Sequence[np.ndarray], joint: in
         step = float(np.median(np.diff(window.time)))
         if joint is None:
             # Samples that are missing are few: a tone keeps its frequency but for the stretch that they are in.
-            yield from ((piece, step, HIGHEST / step) for piece in _cut(rest, round(1 / (STEP * step))))
+            yield from ((piece, step, MAX_FREQUENCY_SHARE / step) for piece in _cut(rest, round(1 / (FREQUENCY_STEP * step))))
         elif _keeps_turning(window.motion.rate[:, joint]):
             turns = window.motion.position[:, joint] / (2 * np.pi)
             order = slice(None, None, int(np.sign(turns[-1] - turns[0])))
-            even = np.arange(turns[order][0], turns[order][-1], 1 / PER_TURN)
+            even = np.arange(turns[order][0], turns[order][-1], 1 / ANGLES_PER_TURN)
             if len(even) < FEWEST_SAMPLES:
                 continue
             taken = np.stack([np.interp(even, turns[order], axis[order]) for axis in rest.T], axis=1)
             fastest = float(np.abs(window.motion.rate[:, joint]).max()) * step / (2 * np.pi)
-            yield from ((piece, 1 / PER_TURN, min(HIGHEST / fastest, HIGHEST * PER_TURN)) for piece in _cut(taken, round(PER_TURN / STEP)))
+            highest = min(MAX_FREQUENCY_SHARE / fastest, MAX_FREQUENCY_SHARE * ANGLES_PER_TURN)
+            yield from ((piece, 1 / ANGLES_PER_TURN, highest) for piece in _cut(taken, round(ANGLES_PER_TURN / FREQUENCY_STEP)))
 
 
 def _keeps_turning(rate):
-    return rate.min() > SLOWEST or rate.max() < -SLOWEST
+    return rate.min() > MIN_ORDER_RATE or rate.max() < -MIN_ORDER_RATE
 
 
 def _cut(rest, longest):
@@ -285,26 +286,26 @@ def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float
     every = list(stretches)
     if not every:
         return
-    grid = STEP * np.arange(round(1 / (STEP * every[0][1])) // 2 + 1)
+    grid = FREQUENCY_STEP * np.arange(round(1 / (FREQUENCY_STEP * every[0][1])) // 2 + 1)
     hits, ratios, plain, excess = np.zeros((4, len(grid), 3))
     count = np.zeros(len(grid), int)
     for rest, step, highest in every:
         inside = (grid * len(rest) * step >= CYCLES_OF_TONE) & (grid <= highest)
-        power, around, inside = _powers(rest, round(1 / (STEP * every[0][1])), inside)
+        power, around, inside = _powers(rest, round(1 / (FREQUENCY_STEP * every[0][1])), inside)
         at = np.flatnonzero(inside)
         count[at] += 1
-        hits[at] += power[at] > CLEAR * around[at]
+        hits[at] += power[at] > MIN_LINE_POWER * around[at]
         ratios[at] += power[at] / around[at]
         plain[at] += power[at] / np.maximum(np.median(power, axis=0), 1e-300)
         excess[at] += np.maximum(power[at] - around[at], 0.0) * 4 / (2 / 3 * len(rest))   # of a line under a Hann window
     if not count.any():
         return
-    chance = np.where(hits > MOSTLY * count[:, None], binom_sf(hits - 1, count[:, None], BY_CHANCE) * np.count_nonzero(count), 1.0)
+    chance = np.where(hits > MOSTLY * count[:, None], binom_sf(hits - 1, count[:, None], LINE_CHANCE) * np.count_nonzero(count), 1.0)
     for axis in range(3):
         mean = ratios[:, axis] / np.maximum(count, 1)
         # The highest significant peak: the surroundings are known by octaves only.
-        best = int(np.argmax(np.where(chance[:, axis] < SIGNIFICANT, plain[:, axis] / np.maximum(count, 1), -1.0)))
-        if chance[best, axis] < SIGNIFICANT:
+        best = int(np.argmax(np.where(chance[:, axis] < TONE_P_VALUE, plain[:, axis] / np.maximum(count, 1), -1.0)))
+        if chance[best, axis] < TONE_P_VALUE:
             yield Tone(sensor, AXES[axis], joint, float(grid[best]), float(np.sqrt(excess[best, axis] / count[best])),
                        float(chance[best, axis]),
                        float(hits[best, axis] / count[best]), grid[count > 0], mean[count > 0])

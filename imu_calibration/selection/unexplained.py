@@ -13,9 +13,9 @@ from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import ExplainedWindows
 from imu_calibration.selection.questions import Question
 
-SIGNIFICANT = 5.0
+SIGNIFICANT_SDS = 5.0
 """Standard deviations above noise from which a rest is significant."""
-LEAST_WINDOWS = 12
+MIN_EXPLAINED_WINDOWS = 12
 """Least number of windows; with fewer the model hardly predicts held-out windows."""
 WITHIN_SHARE = 0.02
 """Least excess of the variance within windows that counts."""
@@ -87,10 +87,10 @@ def _rest(attempt, explained, sensor, excess, values):
     means, within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
     sigma = max(sigma_means, sigma_within) if within > WITHIN_SHARE * explained.n_within else sigma_means
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
-    significant = bool(sigma > SIGNIFICANT and explained.n_means >= 3 * LEAST_WINDOWS)
+    significant = bool(sigma > SIGNIFICANT_SDS and explained.n_means >= 3 * MIN_EXPLAINED_WINDOWS)
     if not significant:
         return Unexplained(False, rms, float(sigma), None, 0.0, residual, noise_sd)
-    if sigma_means <= SIGNIFICANT:
+    if sigma_means <= SIGNIFICANT_SDS:
         inside = np.mean([floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])])
         return Unexplained(True, float(np.sqrt(inside * within / explained.n_within)), float(sigma), None, 0.0, residual, noise_sd)
     if rms == 0:   # less than biases may wander, and more than neighbours may differ

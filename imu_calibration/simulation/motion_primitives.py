@@ -115,9 +115,9 @@ def swing_joints(builder: MotionBuilder, at_deg: np.ndarray, amplitude_deg: np.n
     builder.oscillate(amplitude_deg, frequency, 4.0)
 
 
-ORDERS = ('XYX', 'XYZ', 'XZX', 'XZY', 'YXY', 'YXZ', 'YZX', 'YZY', 'ZXY', 'ZXZ', 'ZYX', 'ZYZ')
+AXIS_ORDERS = ('XYX', 'XYZ', 'XZX', 'XZY', 'YXY', 'YXZ', 'YZX', 'YZY', 'ZXY', 'ZXZ', 'ZYX', 'ZYZ')
 """The twelve orders of three gimbals, from the base outwards."""
-AXIS = {'X': [1.0, 0.0, 0.0], 'Y': [0.0, 1.0, 0.0], 'Z': [0.0, 0.0, 1.0]}
+AXIS_VECTORS = {'X': [1.0, 0.0, 0.0], 'Y': [0.0, 1.0, 0.0], 'Z': [0.0, 0.0, 1.0]}
 EQUAL_ANGLES_DEG = np.arange(0.0, 401.0, 10.0)
 """Avrutov 2017, samples 1 and 2: the 41 equal angles (40 according to the paper)."""
 
@@ -129,7 +129,7 @@ def _table(axes, up=(0.0, 0.0, 1.0), latitude=50.45, height=170.0, rpy_deg=(0.0,
     return {'joints': joints, 'up': list(up), 'latitude': latitude, 'height': height, 'azimuth_deg': 0.0, 'mount': mount}
 
 
-GIMBALS = _table([AXIS[axis] for axis in 'ZYX'])
+GIMBALS = _table([AXIS_VECTORS[axis] for axis in 'ZYX'])
 
 
 def avrutov_rates_deg(sample: int) -> np.ndarray:
@@ -202,8 +202,8 @@ SKEW_60_RPY_DEG = Rotation.from_rotvec(np.pi / 3 * np.ones(3) / np.sqrt(3)).as_e
 
 REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
     **{f'avrutov_{order}{suffix}': (f'41 positions of equal angles 0..400 deg, gimbals {order} from the base; add _up_x or _up_y to turn '
-                                    'gravity', _equal_angles, _table([AXIS[axis] for axis in order], up), 3)
-       for order in ORDERS for suffix, up in (('', AXIS['Z']), ('_up_x', AXIS['X']), ('_up_y', AXIS['Y']))},
+                                    'gravity', _equal_angles, _table([AXIS_VECTORS[axis] for axis in order], up), 3)
+       for order in AXIS_ORDERS for suffix, up in (('', AXIS_VECTORS['Z']), ('_up_x', AXIS_VECTORS['X']), ('_up_y', AXIS_VECTORS['Y']))},
     'avrutov_111': ("the literal reading of 'around three axes simultaneously': one turn about (1, 1, 1)", _equal_angles,
                     _table([[1.0, 1.0, 1.0]]), 1),
     **{f'avrutov_rates_{sample}': (f'gyroscope series of sample {sample} as body rates: one turn about a fixed axis for each row',
@@ -212,7 +212,7 @@ REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
                                      partial(_gimbal_rates, sample=sample), GIMBALS, 3) for sample in (3, 4)},
     'zhang_z0': ('six faces, spins about the sensor axes at 100, 150, 200 deg/s', _zhang_spins, GIMBALS, 3),
     'zhang_z60': ('the same with a fixture skewed by 60 deg about (1, 1, 1)', _zhang_spins,
-                  _table([AXIS[a] for a in 'ZYX'], rpy_deg=SKEW_60_RPY_DEG), 3),
+                  _table([AXIS_VECTORS[a] for a in 'ZYX'], rpy_deg=SKEW_60_RPY_DEG), 3),
     'zhang_o': ('six faces, swings about the sensor axes: 10 deg 1 Hz, 5 deg 2 Hz, 90 deg 0.5 Hz', _zhang_oscillations, GIMBALS, 3),
     'zhang_m': ('six faces, three spins, three swings, three simultaneous turns', _zhang_mixed, GIMBALS, 3),
 }

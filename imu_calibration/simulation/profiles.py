@@ -30,7 +30,7 @@ from imu_calibration.simulation.motion_primitives import (
     two_axes,
 )
 
-LARGEST_SWING = 0.5
+MAX_PROFILE_SWING = 0.5
 """Amplitude of a swing at most, rad or m."""
 
 
@@ -48,7 +48,7 @@ def within_limits(builder: MotionBuilder, rng: np.random.Generator, n_poses: int
     def swing(at, frequency):
         """Swing the joints in which `frequency` is not zero, up to the limits of range, speed and acceleration."""
         omega = 2 * np.pi * np.maximum(frequency, 1e-9)
-        reach = [0.3 * (upper - lower), limits.speed / omega, limits.acceleration / omega**2, np.full(count, LARGEST_SWING)]
+        reach = [0.3 * (upper - lower), limits.speed / omega, limits.acceleration / omega**2, np.full(count, MAX_PROFILE_SWING)]
         amplitude = np.where(frequency > 0, 0.7 * np.minimum.reduce(reach), 0.0)
         middle = np.where(limits.endless, at, np.clip(at, lower + 1.1 * amplitude, upper - 1.1 * amplitude))
         return partial(_swing, middle=middle, amplitude=amplitude, frequency=np.maximum(frequency, 0.1), duration=swing_time)

@@ -21,7 +21,7 @@ from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_
 
 LOUDEST = 0.25
 """Its rms in the band of each axis in its loudest gear, m/s^2."""
-GEARS, HOLD = (0.0, 1.0, 0.5, 0.0, 0.75), 11.0
+GEAR_AMPLITUDES, GEAR_SECONDS = (0.0, 1.0, 0.5, 0.0, 0.75), 11.0
 """Sequence of relative amplitudes of its gears, and time in each gear, s."""
 ALIASED = 0.31
 """Frequency to which the sampling brings it, of the sample rate."""
@@ -39,7 +39,7 @@ def hum_and_variance(time: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndar
         Samples per second.
 
     """
-    loudness = LOUDEST * np.array(GEARS)[(np.asarray(time) // HOLD).astype(int) % len(GEARS)][:, None]
+    loudness = LOUDEST * np.array(GEAR_AMPLITUDES)[(np.asarray(time) // GEAR_SECONDS).astype(int) % len(GEAR_AMPLITUDES)][:, None]
     return loudness * _unit_hum(time, rate), np.tile(loudness**2, 3)
 
 
@@ -54,9 +54,9 @@ def hum_of(variance: np.ndarray, period: float) -> np.ndarray:
     return unit * np.sqrt(variance / BandVariance().of(period, unit)[-1])
 
 
-START_NS = 1_700_000_000_000_000_000
+SESSION_START_NS = 1_700_000_000_000_000_000
 """First stamp of simulated sessions: arbitrary but fixed, so that the same seed gives the same bytes."""
-BLOCK = 100_000
+SIMULATED_BLOCK_SAMPLES = 100_000
 
 
 @dataclass(frozen=True)
@@ -146,20 +146,20 @@ def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: P
     outputs = _outputs(model, values, table, profile, time, options)
     force, rate = add_imu_noise(outputs[0], outputs[1], options.noise, sample_rate=options.imu_rate, rng=rng)
     force, rate = (clip(model, sensor, values, output=output) for sensor, output in zip(SENSORS, (force, rate)))
-    stamps = jitter_stamps(START_NS + np.round(time * 1e9).astype(np.int64), options.noise.stamp_jitter, rng)
+    stamps = jitter_stamps(SESSION_START_NS + np.round(time * 1e9).astype(np.int64), options.noise.stamp_jitter, rng)
     imu = ImuSamples(stamps, force, rate, options.frame_id)
     joint_time = (np.arange(n_joint) + 0.5) / options.joint_rate
     motion = profile.at(joint_time)
     position = read_encoders(motion.position, options.noise, rng)
     velocity = motion.rate if options.with_velocity else np.full_like(motion.rate, np.nan)
-    joints = JointSamples(START_NS + np.round(joint_time * 1e9).astype(np.int64), position, velocity, tuple(table.joint_names))
+    joints = JointSamples(SESSION_START_NS + np.round(joint_time * 1e9).astype(np.int64), position, velocity, tuple(table.joint_names))
     return imu, joints, _temperature_topic(profile, options)
 
 
 def _outputs(model, values, table, profile, time, options):
     parts = []
-    for start in range(0, len(time), BLOCK):
-        now = time[start:start + BLOCK]
+    for start in range(0, len(time), SIMULATED_BLOCK_SAMPLES):
+        now = time[start:start + SIMULATED_BLOCK_SAMPLES]
         parts.append(answered(model, values, table, motion=profile.at(now), time=now, options=options))
     return tuple(np.concatenate(sensor) for sensor in zip(*parts))
 
@@ -192,7 +192,7 @@ def _temperature_topic(profile, options):
     if options.temperature_start_c is None:
         return None
     time = np.arange(0.0, profile.duration, 1.0)
-    return TemperatureSamples(START_NS + np.round(time * 1e9).astype(np.int64), temperature_at(time, options))
+    return TemperatureSamples(SESSION_START_NS + np.round(time * 1e9).astype(np.int64), temperature_at(time, options))
 
 
 BIAS_TIME = 100.0

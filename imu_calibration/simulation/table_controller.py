@@ -129,10 +129,10 @@ def excess(trajectory: JointTrajectory, limits: MotionLimits, step: float = 0.00
     return float(np.max(beyond)), float(np.max(speed)), float(np.max(acceleration))
 
 
-ROUNDING = 1e-6
+LIMIT_ROUNDING = 1e-6
 """Tolerance of a trajectory beyond a limit, relative to it."""
 LIMIT_CHOICES = ('refuse', 'slow', 'none')
-KEPT = 8
+KEPT_MOTIONS = 8
 """Motions kept in memory; queries look back by less."""
 
 
@@ -219,15 +219,15 @@ class TableController:
         return self._take(begin, trajectory)
 
     def _take(self, begin, trajectory):
-        self._taken = [*self._taken, (begin, trajectory)][-KEPT:]
+        self._taken = [*self._taken, (begin, trajectory)][-KEPT_MOTIONS:]
 
     def _within_limits(self, start, points, trajectory):
         beyond, speed, acceleration = excess(trajectory, self.limits)
-        if beyond > ROUNDING:
+        if beyond > LIMIT_ROUNDING:
             raise InputError(f'a trajectory must stay within the range of the joints, it exceeds it by {beyond:.3g} rad or m; '
                              'see the limits in the description of the table', code='joint_range')
         fastest = max(speed, np.sqrt(acceleration))
-        if fastest <= 1.0 + ROUNDING:
+        if fastest <= 1.0 + LIMIT_ROUNDING:
             return trajectory
         if self.settings.limits == 'refuse':
             raise InputError(f'a trajectory must keep to speed and acceleration of the joints, it reaches {speed:.2f} times the one and '

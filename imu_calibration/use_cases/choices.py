@@ -125,7 +125,7 @@ def nominal_of(chosen: str | PathLike | NominalScaling | None) -> NominalScaling
     return NominalScaling(**{name: float(value) for name, value in mapping.items()})
 
 
-SHOWN = 3
+MAX_SHOWN_COLUMNS = 3
 """Columns of an equation that are shown."""
 
 
@@ -154,5 +154,5 @@ def _equation(effect):
     columns = [text for group in effect.groups for text in group.text]
     if not columns or effect.warp is not None:
         return ''
-    shown = ' + '.join(f'k{n} * ({text})' if ' ' in text else f'k{n} * {text}' for n, text in enumerate(columns[:SHOWN], 1))
-    return f'output_i += {shown}{f" + ... ({len(columns)} columns)" if len(columns) > SHOWN else ""}'
+    shown = ' + '.join(f'k{n} * ({text})' if ' ' in text else f'k{n} * {text}' for n, text in enumerate(columns[:MAX_SHOWN_COLUMNS], 1))
+    return f'output_i += {shown}{f" + ... ({len(columns)} columns)" if len(columns) > MAX_SHOWN_COLUMNS else ""}'

@@ -35,7 +35,7 @@ LONGEST_SEPARATION = 180.0
 """Longest duration of a plan that separates effects, s."""
 ACCUMULATOR = '.npz'
 """Suffix of the accumulator that a live session saves with its calibration."""
-START_NS = 1_000_000_000
+PLAN_START_NS = 1_000_000_000
 """First stamp of the bag with the trajectories: any, but the same every time."""
 
 
@@ -98,7 +98,7 @@ class Planned:
     def _messages(self):
         from imu_calibration.planning.repertoire import trajectory
         names, begins = self.plan.motions[0].joint_names, np.concatenate([[0.0], self.plan.ends[:-1]])
-        return [(START_NS + round(float(begin) * 1e9), trajectory(names, segments))
+        return [(PLAN_START_NS + round(float(begin) * 1e9), trajectory(names, segments))
                 for begin, segments in zip(begins, self.plan.segments, strict=True) if segments]
 
     def __str__(self):

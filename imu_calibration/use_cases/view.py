@@ -15,9 +15,9 @@ from imu_calibration.calibration.coverage import (
     ARMS_TIMES,
     ARROW,
     RADIUS,
-    TINY,
+    SEEN_DIAMETER,
+    TEXT_COLOUR,
     VISITED,
-    WHITE,
     Coverage,
     bars_of,
     cells_of,
@@ -27,7 +27,7 @@ from imu_calibration.calibration.coverage import (
 )
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.calibration.hand_workflow import HandResult
-from imu_calibration.calibration.pose_scan import NOTHING, hand_coverage
+from imu_calibration.calibration.pose_scan import NO_FINDINGS, hand_coverage
 from imu_calibration.calibration.result import CalibrationResult, exit_code
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import InputError
@@ -45,7 +45,8 @@ from imu_calibration.use_cases.stand import Stand
 if TYPE_CHECKING:
     from imu_calibration.preprocessing.window import Window
 
-PARAMETERS, RESIDUAL, SPECTRUM, SPHERE = '/imu/parameters', '/imu/residual/windows', '/imu/residual/spectrum', '/imu/coverage'
+PARAMETERS_TOPIC, SPHERE_TOPIC = '/imu/parameters', '/imu/coverage'
+RESIDUAL_TOPIC, SPECTRUM_TOPIC = '/imu/residual/windows', '/imu/residual/spectrum'
 BAND = 1.959964
 """Standard deviations on each side of a value that hold 95 %."""
 NUMBER, TEXT = {'type': 'number'}, {'type': 'string'}
@@ -62,11 +63,11 @@ def _list(**properties):
 XYZ = _object(x=NUMBER, y=NUMBER, z=NUMBER)
 SENSOR_AXES = _object(accelerometer=XYZ, gyroscope=XYZ)
 SCHEMAS = {
-    PARAMETERS: {'title': 'imu_calibration.Parameters', **_object(parameters=_list(
+    PARAMETERS_TOPIC: {'title': 'imu_calibration.Parameters', **_object(parameters=_list(
         name=TEXT, value=NUMBER, sd=NUMBER, low=NUMBER, high=NUMBER, unit=TEXT, tolerance=NUMBER, ratio=NUMBER, status=TEXT))},
-    RESIDUAL: {'title': 'imu_calibration.Residual', **_object(windows=_list(
+    RESIDUAL_TOPIC: {'title': 'imu_calibration.Residual', **_object(windows=_list(
         time=NUMBER, motion=TEXT, before=SENSOR_AXES, after=SENSOR_AXES, floor=SENSOR_AXES))},
-    SPECTRUM: {'title': 'imu_calibration.Spectrum', **_object(lines=_list(frequency=NUMBER, accelerometer=XYZ, gyroscope=XYZ))},
+    SPECTRUM_TOPIC: {'title': 'imu_calibration.Spectrum', **_object(lines=_list(frequency=NUMBER, accelerometer=XYZ, gyroscope=XYZ))},
 }
 """Topic -> JSON schema; SI units, times in s since the first sample."""
 
@@ -153,7 +154,7 @@ def _axes(vector):
     return {axis: float(part) for axis, part in zip('xyz', vector, strict=True) if np.isfinite(part)}
 
 
-SHORTEST = 1.0
+MIN_FILE_SECONDS = 1.0
 """Seconds of a file at least: a player wants a beginning and an end."""
 
 
@@ -197,8 +198,8 @@ def foxglove_bytes(contents: Mapping[str, dict[str, Any]], coverage: Coverage | 
     with sdk.open_mcap(whole, context=context):
         shown = [(channel_of(sdk, topic, context), content) for topic, content in contents.items()]
         if coverage is not None:
-            shown.append((channel_of(sdk, SPHERE, context), scene_of(coverage, frame_id)))
-        for time in (0.0, max(seconds, SHORTEST)):
+            shown.append((channel_of(sdk, SPHERE_TOPIC, context), scene_of(coverage, frame_id)))
+        for time in (0.0, max(seconds, MIN_FILE_SECONDS)):
             for channel, content in shown:
                 channel.log(content, log_time=round(1e9 * time))
     return whole.getvalue()
@@ -206,7 +207,7 @@ def foxglove_bytes(contents: Mapping[str, dict[str, Any]], coverage: Coverage | 
 
 def channel_of(sdk: Any, topic: str, context: Any) -> Any:
     """Return a channel of a topic in a context of foxglove-sdk."""
-    if topic == SPHERE:
+    if topic == SPHERE_TOPIC:
         return sdk.channels.SceneUpdateChannel(topic, context=context)
     return sdk.Channel(topic, schema=SCHEMAS[topic], message_encoding='json', context=context)
 
@@ -230,13 +231,13 @@ def scene_of(coverage: Coverage, frame_id: str) -> Any:
                                     head_length=0.2 * length, head_diameter=0.05, color=color(rgb))
 
     step, arms, center = coverage.next, np.zeros((0, 3)) if coverage.arms is None else coverage.arms, np.zeros(3)
-    balls = [ball(*cell) for cell in cells_of(coverage)] + [ball(1.1 * RADIUS * up, VISITED, TINY) for up in coverage.seen]
+    balls = [ball(*cell) for cell in cells_of(coverage)] + [ball(1.1 * RADIUS * up, VISITED, SEEN_DIAMETER) for up in coverage.seen]
     arrows = [arrow(center, ARMS_TIMES * arm, rgb) for arm, rgb in zip(arms, 0.9 * np.eye(3), strict=False) if arm.any()]
     if step.up is not None:
         arrows.append(arrow(center, 1.25 * RADIUS * step.up, ARROW))
     elif step.axis is not None:
         arrows.append(arrow(-1.25 * RADIUS * step.axis, 2.5 * RADIUS * step.axis, ARROW))
-    line = found.TextPrimitive(pose=pose((0.0, 0.0, 1.6 * RADIUS)), billboard=True, font_size=0.09, color=color(WHITE),
+    line = found.TextPrimitive(pose=pose((0.0, 0.0, 1.6 * RADIUS)), billboard=True, font_size=0.09, color=color(TEXT_COLOUR),
                                text=line_of(coverage))
     entity = found.SceneEntity(timestamp=found.Timestamp(0), frame_id=frame_id, id='coverage', spheres=balls, arrows=arrows, texts=[line])
     return found.SceneUpdate(entities=[entity])
@@ -345,7 +346,7 @@ class View:
         """Content that cannot be shown, with the reason."""
         if self.coverage is None:
             return ('a calibration file contains no residuals: only the parameters are shown; give the recording for residuals',)
-        if SPECTRUM not in self.contents:
+        if SPECTRUM_TOPIC not in self.contents:
             return ('no window with motion was long enough for a spectrum, and by hand there is none: it is left out',)
         return ()
 
@@ -385,16 +386,16 @@ def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **cho
     path = None if isinstance(source, SampleBlock) else _document_of(Path(source))
     if path is None:
         result = calibrate(source, table, **choices).result
-        contents = {PARAMETERS: parameters(result.calibration, result.tolerances), RESIDUAL: residual(result),
-                    SPECTRUM: spectrum(result, result.gathered.kept)}
-        if not contents[SPECTRUM]['lines']:
-            del contents[SPECTRUM]
-        return View(result.calibration, contents, _coverage(result), contents[RESIDUAL]['windows'][-1]['time'])
+        contents = {PARAMETERS_TOPIC: parameters(result.calibration, result.tolerances), RESIDUAL_TOPIC: residual(result),
+                    SPECTRUM_TOPIC: spectrum(result, result.gathered.kept)}
+        if not contents[SPECTRUM_TOPIC]['lines']:
+            del contents[SPECTRUM_TOPIC]
+        return View(result.calibration, contents, _coverage(result), contents[RESIDUAL_TOPIC]['windows'][-1]['time'])
     if table is not None:
         raise InputError('a table or arm needs a recording, a calibration file was given; '
                          'omit one')
     calibration = files.read_calibration(path)
-    return View(calibration, {PARAMETERS: parameters(calibration, tolerances_of(calibration.model))}, None)
+    return View(calibration, {PARAMETERS_TOPIC: parameters(calibration, tolerances_of(calibration.model))}, None)
 
 
 def _document_of(path):
@@ -405,7 +406,7 @@ def _document_of(path):
 
 def _coverage(result: CalibrationResult) -> Coverage:
     if isinstance(result, HandResult):
-        found = hand_coverage(replace(NOTHING, poses=result.hand.poses), result, HandOptions(tolerances=result.options.tolerances))
+        found = hand_coverage(replace(NO_FINDINGS, poses=result.hand.poses), result, HandOptions(tolerances=result.options.tolerances))
     else:
         assert isinstance(result, TableResult), 'a calibration is made by hand or on a table'
         found = table_coverage(result)

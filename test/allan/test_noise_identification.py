@@ -24,11 +24,11 @@ from imu_calibration.allan.processes import (
     mean_covariance,
 )
 from imu_calibration.allan.terms import (
-    DETERMINED,
-    HELD,
     PROCESSES,
-    TIME,
-    WEAK,
+    TERM_DETERMINED,
+    TERM_HELD,
+    TERM_WEAK,
+    TIME_KEY,
     Choice,
     choose_form,
     fit_form,
@@ -66,7 +66,7 @@ def moments_from(values, period=PERIOD):
 def expected_moments(figures, seconds):
     """Allan variances as they are on average."""
     scales = scales_of(int(seconds / PERIOD), PERIOD)
-    processes = {name: gauss_markov(figures[TIME]) if name == 'gauss_markov' else PROCESSES[name] for name in figures if name != TIME}
+    processes = {name: gauss_markov(figures[TIME_KEY]) if name == 'gauss_markov' else PROCESSES[name] for name in figures if name != TIME_KEY}
     variance = sum(figures[name]**2 * scales.expectation(process) for name, process in processes.items())
     return Moments(scales, variance, variance > 0)
 
@@ -124,7 +124,7 @@ def test_several_stretches_add_up_like_one_when_nothing_connects_them():
 
 
 FIGURES = ({'white_noise': 1.0, 'random_walk': 0.05}, {'white_noise': 1.0, 'bias_instability': 0.3}, {'white_noise': 1.0, 'quantisation': 0.05},
-           {'white_noise': 1.0, 'gauss_markov': 0.5, TIME: 1.1**36}, {'white_noise': 1.0, 'bias_instability': 0.2, 'random_walk': 0.02})
+           {'white_noise': 1.0, 'gauss_markov': 0.5, TIME_KEY: 1.1**36}, {'white_noise': 1.0, 'bias_instability': 0.2, 'random_walk': 0.02})
 
 
 @pytest.mark.parametrize('figures', FIGURES, ids=lambda figures: '+'.join(figures))
@@ -132,8 +132,8 @@ def test_the_average_curve_gives_back_its_figures(figures):
     names = tuple(name for name in ('quantisation', 'white_noise', 'bias_instability', 'random_walk', 'gauss_markov') if name in figures)
     fit = fit_names(expected_moments(figures, 3600.0), names)
     np.testing.assert_allclose(np.sqrt(fit.coefficients), [figures[name] for name in names], rtol=1e-6)
-    if TIME in figures:
-        assert fit.processes[-1].time == pytest.approx(figures[TIME], rel=1e-9)
+    if TIME_KEY in figures:
+        assert fit.processes[-1].time == pytest.approx(figures[TIME_KEY], rel=1e-9)
 
 
 def test_intervals_of_one_variance_are_those_of_chi_square():
@@ -152,15 +152,15 @@ def test_a_long_record_determines_its_noise():
     for name, value in figures.items():
         term = found.terms[name]
         assert term.interval[0] < value < term.interval[1] and term.interval[0] < term.value < term.interval[1]
-    assert found.terms['white_noise'].status == DETERMINED
-    assert found.terms['bias_instability'].status == HELD and found.terms['bias_instability'].value is None
+    assert found.terms['white_noise'].status == TERM_DETERMINED
+    assert found.terms['bias_instability'].status == TERM_HELD and found.terms['bias_instability'].value is None
 
 
 def test_ten_minutes_cannot_determine_a_small_random_walk():
     figures = {'white_noise': 1.0, 'random_walk': 0.003}
     found = identify_axis(moments_of(figures, 600.0, 1))
     term = found.terms['random_walk']
-    assert term.status == HELD and term.value is None and term.interval[0] == 0.0 and term.interval[1] > 0.003
+    assert term.status == TERM_HELD and term.value is None and term.interval[0] == 0.0 and term.interval[1] > 0.003
     assert term.reason == 'not seen'
     needed = RecordingTimes(PERIOD).needed((WHITE, RANDOM_WALK), np.array([1.0, 0.003**2]), 1)
     # the walk crosses the noise after N sqrt(3) / K = 580 s; some fifty of these, as a walk of 0.05 needs half an hour
@@ -172,7 +172,7 @@ def test_the_predicted_recording_time_is_what_a_fit_says_of_itself():
     """The interval of a fit on the average curve of a record of the predicted length just meets the criterion."""
     figures = {'white_noise': 1.0, 'random_walk': 0.05}
     length = RecordingTimes(PERIOD).needed((WHITE, RANDOM_WALK), np.array([1.0, 0.05**2]), 1)
-    for seconds, status in ((length, DETERMINED), (length / 3, WEAK)):
+    for seconds, status in ((length, TERM_DETERMINED), (length / 3, TERM_WEAK)):
         term = identify_axis(expected_moments(figures, seconds)).terms['random_walk']
         ratio = term.interval[1] / term.interval[0]
         assert term.status == status, (seconds, ratio)
@@ -184,7 +184,7 @@ def test_a_form_that_explains_the_curve_as_well_makes_a_figure_weak():
     for seed in range(3):
         found = identify_axis(moments_of({'white_noise': 1.0, 'bias_instability': 0.15}, 900.0, seed))
         ambiguous += bool(found.others)
-        assert all(found.terms[name].status != DETERMINED for form in found.others for name in found.form if name not in form)
+        assert all(found.terms[name].status != TERM_DETERMINED for form in found.others for name in found.form if name not in form)
     assert ambiguous
 
 
@@ -242,8 +242,8 @@ def test_a_correlation_time_that_fits_itself_gives_way_to_a_likelier_one():
     truth = draw_truth('tactical', 'gyroscope', FORMS[rng.integers(len(FORMS))], rng)
     moments = moments_from(truth.draw(1_080_000, 0.01, rng), 0.01)
     first, taken = fit_names(moments, ('white_noise', 'gauss_markov')), fit_form(moments, ('gauss_markov',)).fit
-    assert log_cost(moments, taken) < log_cost(moments, first) - 20 and first.processes[-1].time > 10 * truth.figures[TIME]
-    assert taken.processes[-1].time == pytest.approx(truth.figures[TIME], rel=0.3)
+    assert log_cost(moments, taken) < log_cost(moments, first) - 20 and first.processes[-1].time > 10 * truth.figures[TIME_KEY]
+    assert taken.processes[-1].time == pytest.approx(truth.figures[TIME_KEY], rel=0.3)
     assert np.sqrt(taken.coefficients[-1]) == pytest.approx(truth.figures['gauss_markov'], rel=0.3)
 
 
@@ -305,7 +305,7 @@ def test_white_noise_that_is_not_seen_is_held_with_its_bound():
     step = 8 / np.sqrt(period)
     walk = random_walk(36_000, period, 0.3, rng)
     term = identify_axis(moments_from(np.round((walk + 0.3 * step) / step) * step, period)).terms['white_noise']
-    assert (term.status, term.value, term.interval[0]) == (HELD, None, 0.0) and 0 < term.interval[1] < 2
+    assert (term.status, term.value, term.interval[0]) == (TERM_HELD, None, 0.0) and 0 < term.interval[1] < 2
 
 
 def test_the_longest_of_many_rests_keeps_its_own_scales():

@@ -13,7 +13,7 @@ from imu_calibration.allan import identify
 from imu_calibration.allan.document import exit_code, filter_lines, lines, noise_from_text, noise_to_text
 from imu_calibration.allan.identify import figures_of, identify_noise, read_rest
 from imu_calibration.allan.processes import RANDOM_WALK
-from imu_calibration.allan.terms import HELD, Term, identify_axis
+from imu_calibration.allan.terms import TERM_HELD, Term, identify_axis
 from imu_calibration.allan.trends import AxisTrend, Blocks, TrendSearch
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import DocumentError, InputError
@@ -326,7 +326,7 @@ def numbers(part):
 
 def test_an_interval_without_an_upper_end_is_null_in_the_file_and_finite_where_filters_take_it(quiet):
     figures = figures_of(quiet[1])
-    open_ends = {name: Term(name, None, (0.0, np.inf), HELD) for name in ('white_noise', 'random_walk')}
+    open_ends = {name: Term(name, None, (0.0, np.inf), TERM_HELD) for name in ('white_noise', 'random_walk')}
     axis = replace(figures.gyroscope[2], terms=figures.gyroscope[2].terms | open_ends, form=())
     without = replace(figures, gyroscope=(axis,) * 3)
     text = noise_to_text(without)

@@ -13,7 +13,7 @@ from test_live_calibration import blocks
 from imu_calibration.allan.document import noise_to_text, position_budget
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures, bias_processes
 from imu_calibration.allan.processes import FLICKER, RANDOM_WALK, allan_variance, gauss_markov
-from imu_calibration.allan.terms import DETERMINED, HELD, TIME, Term
+from imu_calibration.allan.terms import TERM_DETERMINED, TERM_HELD, TIME_KEY, Term
 from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.calibration.live_poses import LiveByHand
@@ -44,9 +44,9 @@ BAG = Path(__file__).parents[2] / 'bags' / 'sample_session'
 
 def axis_of(**figures):
     """An axis with these figures, nothing else."""
-    terms = {name: Term(name, value, (0.9 * value, 1.1 * value), DETERMINED) for name, value in figures.items()}
-    terms.setdefault('random_walk', Term('random_walk', None, (0.0, 1e-9), HELD))
-    form = tuple(name for name in figures if name not in ('white_noise', TIME))
+    terms = {name: Term(name, value, (0.9 * value, 1.1 * value), TERM_DETERMINED) for name, value in figures.items()}
+    terms.setdefault('random_walk', Term('random_walk', None, (0.0, 1e-9), TERM_HELD))
+    form = tuple(name for name in figures if name not in ('white_noise', TIME_KEY))
     return AxisFigures(terms, form)
 
 
@@ -66,7 +66,7 @@ def test_sums_of_processes_have_the_allan_variance_of_the_noise(name, process):
 
 
 def test_a_gauss_markov_process_stays_as_it_is():
-    figures = noise_of({'white_noise': 1e-3, 'gauss_markov': 0.2, TIME: 90.0}, {'white_noise': 1e-5})
+    figures = noise_of({'white_noise': 1e-3, 'gauss_markov': 0.2, TIME_KEY: 90.0}, {'white_noise': 1e-5})
     (process,) = bias_processes(figures)['accelerometer']
     assert process.time == pytest.approx(90.0) and process.sd == pytest.approx(0.2)
 
@@ -205,6 +205,6 @@ def test_white_noise_that_may_be_none_counts_with_its_bound():
 def test_an_axis_that_allows_any_walk_is_not_the_worst():
     """A vibration can hide a walk of any size; filters want a number, which the other axes have."""
     open_end = axis_of(white_noise=1e-4)
-    open_end.terms['random_walk'] = Term('random_walk', None, (0.0, np.inf), HELD)
+    open_end.terms['random_walk'] = Term('random_walk', None, (0.0, np.inf), TERM_HELD)
     axes = (open_end, axis_of(white_noise=1e-4), axis_of(white_noise=1e-4))
     assert NoiseFigures(axes, axes, 100.0).densities('gyroscope').walk == 1e-9

@@ -110,7 +110,7 @@ def test_windows_for_the_search_are_spread_and_bounded(monkeypatch):
     for window in windows:
         every.add(window)
     assert [w.time[0] for w in every.windows] == [w.time[0] for w in windows]
-    monkeypatch.setattr(gathered, 'MOST_SAMPLES', 4000)
+    monkeypatch.setattr(gathered, 'MAX_KEPT_SAMPLES', 4000)
     some = SpreadWindows()
     for window in windows:
         some.add(window)

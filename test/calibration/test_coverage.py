@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.advice import WEIGHTS, _rollout, foretold
-from imu_calibration.calibration.coverage import DIRECTIONS, ENOUGH, Bar, Coverage, Step, line_of, table_coverage
+from imu_calibration.calibration.coverage import DIRECTIONS, MIN_CELL_WORTH, Bar, Coverage, Step, line_of, table_coverage
 from imu_calibration.calibration.hand_step import HandStep, direction_words, shortest_turn
 from imu_calibration.calibration.live_poses import LiveByHand
-from imu_calibration.calibration.pose_scan import NOTHING, hand_coverage, knowledge_of
+from imu_calibration.calibration.pose_scan import NO_FINDINGS, hand_coverage, knowledge_of
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
@@ -28,12 +28,12 @@ OPTIONS = HandOptions(gravity=GRAVITY)
 
 def start():
     """What is known before anything came."""
-    return hand_coverage(NOTHING, None, OPTIONS)
+    return hand_coverage(NO_FINDINGS, None, OPTIONS)
 
 
 def knowing(*ups, factor=1.0):
     """Knowledge after rests with some directions up, in order."""
-    knowledge = knowledge_of(NOTHING, None, OPTIONS)
+    knowledge = knowledge_of(NO_FINDINGS, None, OPTIONS)
     for up in ups:
         up = np.array(up, float) / np.linalg.norm(up)
         knowledge = knowledge.then(HandStep(up))
@@ -69,7 +69,7 @@ def test_an_attitude_that_nobody_took_is_worth_nothing_once_everything_is_known(
     ups = [d for d in DIRECTIONS if d[2] > -0.9]
     enough = knowing(*ups, *ups, factor=10.0)
     _, worth, _ = enough.best()
-    assert foretold(enough) == [] and (worth < ENOUGH).all()
+    assert foretold(enough) == [] and (worth < MIN_CELL_WORTH).all()
 
 
 def test_what_is_foretold_takes_off_what_is_missing():

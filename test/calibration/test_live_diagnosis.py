@@ -216,7 +216,7 @@ class Slow:
 
 
 def test_the_thread_answers_when_asked_and_once_at_a_time(monkeypatch):
-    monkeypatch.setattr('imu_calibration.nodes.diagnosis_thread.SHARE', 1.0)   # a busy machine makes the first answer long, and the pause after it
+    monkeypatch.setattr('imu_calibration.nodes.diagnosis_thread.MAX_DIAGNOSIS_SHARE', 1.0)   # a busy machine makes the first answer long, and the pause after it
     thread, question = DiagnosisThread(3600.0), Slow('first')
     thread.ask_when_due(question, True)
     assert question.asked == 0 and thread.state.word == 'waiting'   # the period is not over

@@ -14,7 +14,7 @@ from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import Regime, moving_pieces
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.gathered import FOLDS, HeldOut
+from imu_calibration.references.turntable.gathered import TABLE_FOLDS, HeldOut
 from imu_calibration.use_cases.calibrate import calibrate
 
 from worlds.misfit_worlds import make_pair
@@ -76,7 +76,7 @@ def test_a_fold_is_left_out_as_if_it_had_not_been_recorded(clean):
     without = dealt.values_without(result.solution)
     rest = Accumulator()
     for k, block in enumerate(dealt.blocks):
-        if k % FOLDS != 2:
+        if k % TABLE_FOLDS != 2:
             rest.merge(block.accumulator)
     assert not rest.blocks   # memory that nobody needs
     again = solve(rest, result.model, noise=result.solution.noise)

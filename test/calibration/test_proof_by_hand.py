@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.hand_proof import FOLDS, prove_by_hand, values_without
+from imu_calibration.calibration.hand_proof import HAND_PROOF_FOLDS, prove_by_hand, values_without
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import HELPS, decide
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
@@ -33,7 +33,7 @@ def test_a_good_calibration_is_proven_on_poses_and_turns(session):
 
 def test_a_part_is_left_out_as_if_it_had_not_been_recorded(session):
     hand = solve_by_hand(session, OPTIONS)
-    out = np.arange(20) % FOLDS == 3
+    out = np.arange(20) % HAND_PROOF_FOLDS == 3
     (step,) = values_without(hand, session.turns, [out])
     place = np.cumsum(~out) - 1
     rest = [replace(turn, first=int(place[turn.first]), last=int(place[turn.last])) for turn in session.turns if not (out[turn.first] or out[turn.last])]

@@ -14,8 +14,8 @@ import pytest
 from imu_calibration.calibration.pose_scan import Findings, hand_status
 from imu_calibration.cli.main import main
 from imu_calibration.cli.parser import VERBS, hints_of, make_parser
-from imu_calibration.core.errors import KEYS, InputError, with_hint
-from imu_calibration.core.errors import VERBS as PROGRAMS
+from imu_calibration.core.errors import ERROR_KEYS, InputError, with_hint
+from imu_calibration.core.errors import REMEDY_VERBS as PROGRAMS
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.estimation.solution import COMMON_SCALE
 from imu_calibration.nodes.parameters import HINTS
@@ -43,11 +43,11 @@ def test_no_text_of_the_core_names_an_option_of_the_command_line():
 def keys_in(trees):
     """Return the keys of errors in modules."""
     return {part.value for tree in trees for node in ast.walk(tree) if isinstance(node, ast.keyword) and node.arg == 'key'
-            for part in ast.walk(node.value) if isinstance(part, ast.Constant) and part.value in KEYS}
+            for part in ast.walk(node.value) if isinstance(part, ast.Constant) and part.value in ERROR_KEYS}
 
 
 def test_no_text_of_the_core_tells_to_run_a_verb():
-    """The user of a node has no recording; `errors.VERBS` are replaced there."""
+    """The user of a node has no recording; `errors.REMEDY_VERBS` are replaced there."""
     found = {(path.stem, verb) for path, tree in core() for node in ast.walk(tree) if path.stem not in ('errors', 'page')
              if isinstance(node, ast.Constant) and isinstance(node.value, str)
              for verb in re.findall(r"(?<!written by )'imu_calibration (\w+)'", node.value)}
@@ -83,8 +83,8 @@ def test_every_key_that_can_reach_a_node_has_a_name_there(node):
 
 def test_every_key_is_known_and_every_known_one_is_used():
     used = keys_in(tree for _, tree in core())
-    from msg_adapters.bag import KEYS as topics
-    assert used | set(topics.values()) == set(KEYS)
+    from msg_adapters.bag import TOPIC_KEYS as topics
+    assert used | set(topics.values()) == set(ERROR_KEYS)
 
 
 def hints_and_options(verb):
@@ -102,14 +102,14 @@ def test_a_verb_names_only_options_that_it_has(verb):
 
 
 def test_every_key_is_an_option_of_some_verb():
-    assert {key for verb in VERBS for key in hints_and_options(verb)[0]} == set(KEYS) - set(PROGRAMS)
+    assert {key for verb in VERBS for key in hints_and_options(verb)[0]} == set(ERROR_KEYS) - set(PROGRAMS)
 
 
 @pytest.mark.parametrize('node', HINTS)
 def test_a_node_names_only_parameters_and_topics_that_it_has(node):
     parameters = re.findall(r'^    (?:# )?(\w+):', (ROOT / f'config/{node}.yaml').read_text(), flags=re.M)
     source = (ROOT / f'imu_calibration/nodes/{node}.py').read_text()
-    assert set(HINTS[node]) <= set(KEYS)
+    assert set(HINTS[node]) <= set(ERROR_KEYS)
     assert set(HINTS[node]) >= ({'anyway'} if 'anyway' in parameters else set())
     for key, hint in HINTS[node].items():
         if key in PROGRAMS:

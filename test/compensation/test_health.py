@@ -10,8 +10,8 @@ from imu_calibration.compensation.health import (
     FOLLOWED,
     HARMS,
     HOLDS,
-    LEAST,
-    LONGEST,
+    MAX_STOP_SECONDS,
+    MIN_STOP_SECONDS,
     MOST_MOVED,
     MOVED,
     UNIT,
@@ -68,7 +68,7 @@ def test_how_a_stream_is_cut_does_not_change_the_stops():
 def test_a_robot_that_is_parked_counts_as_several_stops():
     world = drive(5, 3, period=200.0, stop=150.0)
     watch, _ = follow(world)
-    assert watch.health.n_stops == int(130 // LONGEST) + 1
+    assert watch.health.n_stops == int(130 // MAX_STOP_SECONDS) + 1
 
 
 def test_while_nothing_moves_the_calibration_holds():
@@ -108,7 +108,7 @@ def test_readings_in_g_are_the_cause():
 def test_before_the_first_stop_it_waits():
     watch, _ = follow(drive(0, 1), cut=int(30 * RATE))
     assert watch.health.state.word == WAITING
-    short, _ = follow(drive(0, 1, stop=LEAST), cut=int(41 * RATE))
+    short, _ = follow(drive(0, 1, stop=MIN_STOP_SECONDS), cut=int(41 * RATE))
     assert short.health.state.word == WAITING
 
 

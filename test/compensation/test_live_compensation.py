@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.compensation.angular_acceleration import WARM_UP
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.nodes.message_compensation import LiveCompensation
+from imu_calibration.preprocessing.stamping import MIN_PERIOD_STEPS
 from msg_adapters.imu import FIELDS, N_DOUBLES
 from msg_adapters.write import encode_imu
 from validation.imu_messages import parse_imu, patch_imu
@@ -55,7 +55,7 @@ def test_messages_come_out_as_blocks_do_offline(effects, transfer):
     live = LiveCompensation(calibration, transfer)
     out = [live(data) for data in messages(imu)]
     offline = CompensationStream(calibration, transfer=transfer).correct(imu)
-    settled = slice(WARM_UP + 60, None)   # the window of the derivative starts after the warm-up and is up to 20 ms + 20 ms long
+    settled = slice(MIN_PERIOD_STEPS + 60, None)   # the window of the derivative starts after the warm-up and is up to 20 ms + 20 ms long
     np.testing.assert_allclose([field(d, 'force_s') for d in out[settled]], offline.force[settled], atol=1e-9)
     np.testing.assert_allclose([field(d, 'rate_s') for d in out[settled]], offline.rate[settled], atol=1e-10)
     assert [parse_imu(d).stamp_ns for d in out] == imu.stamp_ns.tolist()

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_differentiation import slopes
 
-from imu_calibration.compensation.angular_acceleration import WARM_UP, CausalDerivative, StampedDerivative, typical_period
+from imu_calibration.compensation.angular_acceleration import CausalDerivative, StampedDerivative, typical_period
+from imu_calibration.preprocessing.stamping import MIN_PERIOD_STEPS
 
 PERIOD_NS = 5_000_000
 
@@ -82,6 +83,6 @@ def test_rounding_does_not_add_up():
 
 
 def test_typical_period_is_the_median_step_ahead():
-    stamps = np.cumsum([0, *[PERIOD_NS] * WARM_UP, 0, 7 * PERIOD_NS, -PERIOD_NS])
+    stamps = np.cumsum([0, *[PERIOD_NS] * MIN_PERIOD_STEPS, 0, 7 * PERIOD_NS, -PERIOD_NS])
     assert typical_period(stamps) == pytest.approx(5e-3)
     assert typical_period([5]) is None

@@ -11,7 +11,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.comparison import LEVEL, compare
+from imu_calibration.document.comparison import COMPARISON_P_VALUE, compare
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED, FIXED, HELD
 
@@ -38,7 +38,7 @@ def moved(calibration, name, by):
 def test_honest_calibrations_disagree_no_more_often_than_stated():
     rng = np.random.default_rng(3)
     disagreements = sum(not compare(draw(rng), draw(rng)).agree for _ in range(400))
-    assert disagreements <= 400 * LEVEL + 3 * np.sqrt(400 * LEVEL) + 1
+    assert disagreements <= 400 * COMPARISON_P_VALUE + 3 * np.sqrt(400 * COMPARISON_P_VALUE) + 1
 
 
 def test_a_calibration_agrees_with_itself():

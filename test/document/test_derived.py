@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.diagnosis.sentences import sentence
-from imu_calibration.calibration.installation_angles import PAIRS, angles_of, derive, in_paper_units, split
+from imu_calibration.calibration.installation_angles import AXIS_PAIRS, angles_of, derive, in_paper_units, split
 from imu_calibration.core.samples import NominalScaling
-from imu_calibration.core.units import NOISE, decimals, for_people, significant, with_sd
+from imu_calibration.core.units import NOISE_QUANTITY, decimals, for_people, significant, with_sd
 from imu_calibration.core.units import STANDARD_GRAVITY as G
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.catalogue import term
@@ -65,7 +65,7 @@ def test_standard_deviations_are_those_of_random_matrices():
     tolerance = {'rel': 0.06}  # 4000 draws: 1.1 % each, five of it
     assert found.scale_sd == pytest.approx(scales.std(axis=0), **tolerance)
     assert found.angles_sd == pytest.approx(np.array([angles_of(a) for a in axes]).std(axis=0), **tolerance)
-    between = np.array([[np.arccos(a[i] @ a[j]) for i, j in PAIRS] for a in axes])
+    between = np.array([[np.arccos(a[i] @ a[j]) for i, j in AXIS_PAIRS] for a in axes])
     assert found.between_sd == pytest.approx(between.std(axis=0), **tolerance)
 
 
@@ -101,7 +101,7 @@ def test_the_unit_of_a_parameter_depends_on_its_sensor():
     factor, unit = for_people('(m/s^2)^-1', 'gyroscope.scale_by_force.x')
     assert (factor, unit) == (pytest.approx(100 * G), '% per g')
     assert for_people('(m/s^2)^-1', 'accelerometer.accel_quadratic.x') == (pytest.approx(1e3 * G), 'mg/g²')
-    assert for_people('rad/s', 'gyroscope')[1] == 'deg/s' and for_people('rad/s', NOISE)[1] == 'deg/h'
+    assert for_people('rad/s', 'gyroscope')[1] == 'deg/s' and for_people('rad/s', NOISE_QUANTITY)[1] == 'deg/h'
     force = term('scale_by_force', sensor='gyroscope', column='w_x * f_x', unit='(m/s^2)^-1', tolerance=1e-5, text='Scale by force.')
     for text in (sentence(force, {'gyroscope.scale_by_force.x': (1e-3, 1e-5, '(m/s^2)^-1')}, None),
                  people(1e-3, 1e-5, '(m/s^2)^-1', quantity='gyroscope.scale_by_force.x')[2]):

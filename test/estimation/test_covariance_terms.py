@@ -11,7 +11,7 @@ from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.compensation.compensate import invertible_values
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text, from_mapping, to_mapping
-from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD, NOISE, REJECTED, replace_weak, total
+from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD_PRIORS, REJECTED, SAMPLE_NOISE, replace_weak, total
 from imu_calibration.estimation.solution import REPLACEMENT
 
 SESSION = imu.simulate('quick', seed=2)
@@ -27,7 +27,7 @@ def by_table():
 def test_a_weak_value_is_replaced_by_the_sd_of_the_fit_alone():
     """An allowance decides that a value is weak, not that its prior is nearer; correlated values follow, and the shift enters the sds."""
     fit = np.array([[1.0, 0.9, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    terms, prior = {NOISE: 0.75 * fit, BIAS_PROCESS: 0.25 * fit, 'model_error': 100.0 * np.eye(3)}, np.zeros(3)
+    terms, prior = {SAMPLE_NOISE: 0.75 * fit, BIAS_PROCESS: 0.25 * fit, 'model_error': 100.0 * np.eye(3)}, np.zeros(3)
     for value, moves in ((0.5, True), (1.5, False)):
         values = np.array([value, 2.0, 1.0])
         found, grown, replaced = replace_weak(values, terms, prior, weak=[0])
@@ -47,7 +47,7 @@ def test_the_sds_of_replaced_values_agree_with_their_errors():
     z, gain = [], []
     for truth in rng.normal(scale=0.7, size=(4000, 2)):
         values = rng.multivariate_normal(truth, fit)
-        found, terms, replaced = replace_weak(values, {NOISE: fit}, np.zeros(2), weak=[0])
+        found, terms, replaced = replace_weak(values, {SAMPLE_NOISE: fit}, np.zeros(2), weak=[0])
         if replaced[0]:
             z.append((found - truth)**2 / np.diag(total(terms)))
             gain.append([(found - truth)**2, (values - truth)**2])
@@ -94,10 +94,10 @@ def test_offsets_of_windows_are_a_term_apart_from_white_noise(by_table):
     walking = {sensor: replace(noise, offset_sd=1e-2) for sensor, noise in white.items()}
     first, second = (solve(accumulator, by_table.gathered_model, prior=make_prior(by_table.gathered_model), noise=each)
                      for each in (white, walking))
-    scale = np.diag(first.terms[NOISE])
+    scale = np.diag(first.terms[SAMPLE_NOISE])
     assert np.all(np.abs(np.diag(first.terms[BIAS_PROCESS])) <= 1e-6 * scale)
     bias = first.model.slices['accelerometer', 'bias']
-    assert np.all(np.diag(second.terms[BIAS_PROCESS])[bias] > 0.9 * np.diag(second.covariance - second.terms[HELD])[bias])
+    assert np.all(np.diag(second.terms[BIAS_PROCESS])[bias] > 0.9 * np.diag(second.covariance - second.terms[HELD_PRIORS])[bias])
 
 
 def test_the_solution_without_clipped_samples_has_the_terms_of_the_search(by_table):

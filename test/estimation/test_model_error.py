@@ -10,7 +10,7 @@ from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import accumulator as accumulator_module
 from imu_calibration.estimation.accumulator import Accumulator, restrict
-from imu_calibration.estimation.model_error import LEAST_BLOCKS, NO_BIAS, Waves, errors_of_waves
+from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, NO_BIAS, Waves, errors_of_waves
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
@@ -91,13 +91,13 @@ def test_errors_that_go_with_the_motion_are_in_the_standard_deviations(cause):
 
 def test_few_blocks_say_nothing(windows):
     """Scatter of fewer blocks than it takes is not looked at."""
-    few = solved(measured(windows, lambda share: 0.01 * share, 1)[:LEAST_BLOCKS - 1])
+    few = solved(measured(windows, lambda share: 0.01 * share, 1)[:MIN_SCATTER_BLOCKS - 1])
     assert np.all(grown(few) == 1.0)
 
 
 def test_blocks_are_bounded_and_hold_all_rows(windows, monkeypatch):
     """However long the session, the number of blocks is bounded, and together they hold what the whole holds; columns are picked in both."""
-    monkeypatch.setattr(accumulator_module, 'MOST_BLOCKS', 6)
+    monkeypatch.setattr(accumulator_module, 'MAX_ACCUMULATOR_BLOCKS', 6)
     total = accumulated(windows)
     assert 3 <= len(total.blocks) <= 6
     assert sum(block.windows for block in total.blocks) == len(windows)
@@ -110,7 +110,7 @@ def test_blocks_are_bounded_and_hold_all_rows(windows, monkeypatch):
 
 def test_blocks_hold_all_rows_when_means_are_joined(windows, monkeypatch):
     """The difference of two windows that are joined into one mean row goes to their block as well."""
-    monkeypatch.setattr(accumulator_module, 'CAPACITY', 20)
+    monkeypatch.setattr(accumulator_module, 'MAX_MEAN_ROWS', 20)
     total = accumulated(windows)
     key = ('gyroscope', 'static')
     parts = sum(block.within[key].T @ block.within[key] for block in total.blocks if key in block.within)
@@ -139,7 +139,7 @@ def test_blocks_survive_a_restart(windows):
 
 
 def test_accumulators_of_one_recording_share_its_memory(windows, monkeypatch):
-    monkeypatch.setattr(accumulator_module, 'CAPACITY', 40)
+    monkeypatch.setattr(accumulator_module, 'MAX_MEAN_ROWS', 40)
     monkeypatch.setattr(accumulator_module, 'LEAST_ROWS', 4)
     shared = Accumulator(share=8)
     for window in reduce_windows(windows, MODEL, TABLE):

@@ -36,7 +36,7 @@ def session():
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
     """A node reports silent streams after half a second."""
-    monkeypatch.setattr(calibration_node, 'PATIENCE', 0.5)
+    monkeypatch.setattr(calibration_node, 'MAX_SILENCE_SECONDS', 0.5)
 
 
 def start(bench, folder, **parameters):

@@ -14,7 +14,7 @@ from imu_calibration.document.calibration_text import calibration_from_text, cal
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.session import START_NS
+from imu_calibration.simulation.session import SESSION_START_NS
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 
@@ -96,7 +96,7 @@ def check_the_stream(corrected, bag):
     """One-second means of the corrected stream lie within a tenth of the raw errors of the truth."""
     with open_recording(bag) as recording:
         raw = next(recording.blocks()).imu
-    time = (corrected.stamp_ns - START_NS) * 1e-9
+    time = (corrected.stamp_ns - SESSION_START_NS) * 1e-9
     truth = reference_motion(TABLE, make_profile('tumbling', 1, TABLE).at(time))
     _, here, there = np.intersect1d(corrected.stamp_ns, raw.stamp_ns, return_indices=True)
     assert len(here) == len(corrected) > 0.99 * len(raw)

@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from imu_calibration.calibration.coverage import GroupState  # noqa: E402
 from imu_calibration.calibration.diagnosis.live_diagnosis import DiagnosisState  # noqa: E402
 from imu_calibration.nodes.calibration_status import (  # noqa: E402
-    PATIENCE,
+    MIN_ADVICE_SECONDS,
     CalibrationGuide,
     WorkerState,  # noqa: E402
     statuses_of,  # noqa: E402
@@ -84,7 +84,7 @@ def test_the_guide_says_every_change_once(now):
     said = []
     for state in states:
         for _ in range(3):
-            now[0] += PATIENCE
+            now[0] += MIN_ADVICE_SECONDS
             said += guide.lines(state)
     assert [line for _, line in said] == [
         'Imu messages are received on /imu from /driver, reliable', 'JointState messages are received on /imu from /driver, reliable',

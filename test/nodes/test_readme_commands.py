@@ -10,7 +10,7 @@ import time
 import pytest
 
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.nodes.parameters import UNKNOWN
+from imu_calibration.nodes.parameters import UNKNOWN_PARAMETER
 
 from worlds.compensation_cases import random_calibration
 
@@ -193,4 +193,4 @@ def test_what_runs_starts_as_printed_and_ends_on_ctrl_c(terminals, command):
         terminal.wait('/sample_session .*10 .*/imu/data_raw')
     code = terminal.interrupt()
     assert code == 0, f'{code}\n{terminal.shown()}'
-    assert 'Traceback' not in terminal.shown() and UNKNOWN not in terminal.shown(), terminal.shown()
+    assert 'Traceback' not in terminal.shown() and UNKNOWN_PARAMETER not in terminal.shown(), terminal.shown()

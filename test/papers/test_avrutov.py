@@ -120,14 +120,14 @@ def test_a5_designs_that_do_not_determine_the_model_are_refused():
         design = avrutov.design_matrix(inputs, model)
         show('A5', f'rank of {name}', numerical_rank(design), rank)
         assert numerical_rank(design) == rank
-        assert len(null_directions(design, avrutov.COLUMNS[model])) == design.shape[1] - rank
+        assert len(null_directions(design, avrutov.MODEL_COLUMNS[model])) == design.shape[1] - rank
         with refused(NotObservableError, 'rank', rank, design.shape[1]):
             avrutov.calibrate(inputs, np.ones((len(inputs), 3)), model)
 
 
 def test_a5_equal_rates_name_the_axes_and_not_the_bias():
     rates = np.repeat(np.arange(0, 101.0, 10)[:, None], 3, axis=1)
-    named = set().union(*null_directions(avrutov.design_matrix(rates), avrutov.COLUMNS['linear']))
+    named = set().union(*null_directions(avrutov.design_matrix(rates), avrutov.MODEL_COLUMNS['linear']))
     assert named == {'x', 'y', 'z'}
 
 
@@ -138,7 +138,7 @@ def test_a5_full_quadratic_cannot_be_seen_at_one_g():
     ranks = [numerical_rank(avrutov.design_matrix(inputs, 'quadratic')) for inputs in (anywhere, readings('ZYX', 'z'))]
     show('A5', 'rank of the full quadratic: anywhere at 1 g, ZYX g//z', ranks, '9 8')
     assert ranks == [9, 8]
-    named = null_directions(avrutov.design_matrix(anywhere, 'quadratic'), avrutov.COLUMNS['quadratic'])
+    named = null_directions(avrutov.design_matrix(anywhere, 'quadratic'), avrutov.MODEL_COLUMNS['quadratic'])
     assert set(named[0]) == {'bias', 'xx', 'yy', 'zz'}
 
 
@@ -155,7 +155,7 @@ def test_a6_full_rank_but_useless_gyro_series_are_flagged(rates, model, expected
     design = avrutov.design_matrix(rates, model)
     assert numerical_rank(design) == len(expected)
     scaled = tolerance_scaled(design, tolerances, sigma=1e-3)
-    weak = [name for name, ratio in zip(avrutov.COLUMNS[model], scaled.sd_over_tolerance) if ratio > 1]
+    weak = [name for name, ratio in zip(avrutov.MODEL_COLUMNS[model], scaled.sd_over_tolerance) if ratio > 1]
     show('A6', 'flagged at 1 mV', weak, 'not empty')
     assert 'z' in weak and 'y' in weak
     good = tolerance_scaled(avrutov.design_matrix(avrutov.factorial_rates(100.0), model), tolerances, sigma=1e-3)

@@ -14,7 +14,16 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
 from imu_calibration.kinematics.table import Table
-from imu_calibration.planning.campaign import IN_VAIN, PATIENCE, TIME_OVER, Campaign, CampaignSettings, Suspect, separator_of, with_suspect
+from imu_calibration.planning.campaign import (
+    IN_VAIN,
+    STALL_MOTIONS,
+    TIME_OVER,
+    Campaign,
+    CampaignSettings,
+    Suspect,
+    separator_of,
+    with_suspect,
+)
 from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
 from imu_calibration.planning.path_watch import PathWatch, at_rest
 from imu_calibration.planning.situation import noise_of_grade
@@ -384,7 +393,7 @@ def test_a_campaign_ends_when_the_time_is_over_or_motions_bring_nothing_any_more
     assert over[:3] == ['move'] * 3 and len(over) == 4 and over[3].startswith(TIME_OVER) and ' 10 s' in over[3]
     assert carried_out(Campaign(OldHand(100), CampaignSettings(time_limit=30.0)))[3].startswith(TIME_OVER)
     vain = carried_out(Campaign(OldHand(100, floor=8.0)))   # misfit, say, that no motion takes away
-    assert vain[:PATIENCE + 1] == ['move'] * (PATIENCE + 1) and vain[-2] == 'diagnose' and vain[-1].startswith(IN_VAIN)
+    assert vain[:STALL_MOTIONS + 1] == ['move'] * (STALL_MOTIONS + 1) and vain[-2] == 'diagnose' and vain[-1].startswith(IN_VAIN)
     assert carried_out(Campaign(OldHand(30)))[-1] == 'all within tolerance'   # what goes on halving is worth its while
 
 

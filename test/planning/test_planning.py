@@ -25,7 +25,7 @@ from imu_calibration.planning import belief
 from imu_calibration.planning.belief import SAMPLING, WindowPredictor, exact_information
 from imu_calibration.planning.campaign import make_separator
 from imu_calibration.planning.coordinates import Coordinates
-from imu_calibration.planning.planner import DONE, make_planner
+from imu_calibration.planning.planner import GOAL_REACHED, make_planner
 from imu_calibration.planning.repertoire import MotionKind, Repertoire
 from imu_calibration.planning.situation import LEAST_RESTS, Situation, noise_of_grade
 from imu_calibration.references.options import CalibrationOptions, choose_model
@@ -96,7 +96,7 @@ def test_next_motions_end_when_all_is_known_and_take_says_what_is(plan, table):
     # the rests with which a session begins are made in any case: the proof holds out some of the windows
     assert [planner.next_motion(position).motion.kind for _ in range(LEAST_RESTS - 1)] == [MotionKind.POSE] * (LEAST_RESTS - 1)
     assert planner.next_motion(position).motion is None
-    assert planner.next_motion(position).reason == DONE
+    assert planner.next_motion(position).reason == GOAL_REACHED
     far = replace(known, covariance=100.0 * known.covariance)
     planner.take(far)
     assert planner.next_motion(position).motion is not None
@@ -319,6 +319,6 @@ def test_the_memory_of_a_plan_does_not_grow_with_the_square_of_an_arms_joints(ta
     move = MotionBuilder(3)
     move.move_to([1.0, -0.5, 2.0])
     found = WindowPredictor(table, Coordinates(model, tolerances_of(model)), NOISE, rate=100.0).predict([tuple(move.segments)] * 1000)
-    assert len(found) == 1000 and max(lengths) <= 1.05 * belief.BLOCK < sum(lengths) / 2
+    assert len(found) == 1000 and max(lengths) <= 1.05 * belief.BELIEF_BLOCK_ROWS < sum(lengths) / 2
     arm = table_from_urdf(SEVEN_AXES, 'imu_link', {'gravity': 9.81})
     assert 20 <= len(Repertoire(arm, limits_of(arm)).places) <= 45

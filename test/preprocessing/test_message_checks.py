@@ -4,25 +4,34 @@ import numpy as np
 import pytest
 
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.preprocessing.recording_evidence import ABSENT, GOOD, NOTE, OLD, QUANTITIES, WARNING, MessageEvidence, check_messages
+from imu_calibration.preprocessing.recording_evidence import (
+    ABSENT_MARK,
+    GOOD,
+    MESSAGE_QUANTITIES,
+    NOTE,
+    OLD,
+    WARNING,
+    MessageEvidence,
+    check_messages,
+)
 from msg_adapters.imu_stream import ImuHeads
 from msg_adapters.write import encode_imu, rows
 
 KNOWN = np.diag([1e-4, 2e-4, 3e-4])
-NONE = np.diag([ABSENT, 0.0, 0.0])
+NONE = np.diag([ABSENT_MARK, 0.0, 0.0])
 UNIT = np.array([0.0, 0.0, 0.6, 0.8])
 
 
 def evidence(**changed):
     """Messages of a good driver, but for what is `changed`."""
-    given = {'frame_ids': {'imu_link': 600}, 'covariances': dict(zip(QUANTITIES, (KNOWN, KNOWN, NONE), strict=True)), 'orientation': np.zeros(4),
+    given = {'frame_ids': {'imu_link': 600}, 'covariances': dict(zip(MESSAGE_QUANTITIES, (KNOWN, KNOWN, NONE), strict=True)), 'orientation': np.zeros(4),
              'age': np.full(600, 0.002)}
     return MessageEvidence(**given | changed)
 
 
 def covariances(force=KNOWN, rate=KNOWN, orientation=NONE):
     """The three covariances of a message."""
-    return {'covariances': dict(zip(QUANTITIES, (force, rate, orientation), strict=True))}
+    return {'covariances': dict(zip(MESSAGE_QUANTITIES, (force, rate, orientation), strict=True))}
 
 
 def test_a_good_driver_is_left_in_peace():
@@ -79,7 +88,7 @@ def test_what_stands_in_the_bytes_is_what_is_checked():
     found = heads.evidence()
     assert found.frame_ids == {'imu_link': 4, 'other': 2}
     np.testing.assert_allclose(found.age, [0.01, 0.0, 0.01, 0.0])
-    assert found.covariances['orientation'][0, 0] == ABSENT and not found.covariances['specific force'].any()
+    assert found.covariances['orientation'][0, 0] == ABSENT_MARK and not found.covariances['specific force'].any()
 
 
 def test_nothing_heard_is_nothing_known():

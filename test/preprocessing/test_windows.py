@@ -11,10 +11,10 @@ from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, 
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.rest_detection import find_still
-from imu_calibration.preprocessing.spike_filter import REACH
+from imu_calibration.preprocessing.spike_filter import SPIKE_REACH
 from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT
 from imu_calibration.preprocessing.window import WindowSettings
-from imu_calibration.preprocessing.window_cutter import SHORTEST, WanderLimit
+from imu_calibration.preprocessing.window_cutter import MIN_MOVING_SECONDS, WanderLimit
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 
@@ -455,7 +455,7 @@ def test_memory_is_bounded_when_a_stream_is_silent(case):
     longest = JOINT_WAIT + 2 * 20 + 4 * 2 + 5  # waiting, two chunks or windows, margins, batch
     assert held < 2 * 20 * longest
     used = sum(len(window) for window in windows)
-    held_back = REACH if case == 'imu stops' else 0   # by the filter of spikes, and late when the joints have gone on for so long
+    held_back = SPIKE_REACH if case == 'imu stops' else 0   # by the filter of spikes, and late when the joints have gone on for so long
     assert used == {'no joints': 0, 'no imu': 0, 'both there': 12000}.get(case, 2000 - held_back)
     expected = {'no joints': 12000, 'joints stop': 10000}.get(case, 0)
     assert gatherer.counts.get('no joint state', 0) == expected
@@ -496,7 +496,7 @@ def test_the_quieter_the_accelerometer_the_shorter_its_moving_windows():
         assert limit.pieces(samples) == 1
         limit.rested(samples)
         cuts[density, jitter] = limit.pieces(samples)
-    assert list(cuts.values()) == [np.ceil(time[-1] / SHORTEST), 3, 1, 1]
+    assert list(cuts.values()) == [np.ceil(time[-1] / MIN_MOVING_SECONDS), 3, 1, 1]
 
 
 class SimpleSamples:
@@ -516,4 +516,4 @@ def test_long_motion_of_a_quiet_imu_is_cut_short_and_rests_are_not():
     builder.rest(8.0)
     found = [gather(*record(Profile('', tuple(builder.segments)), force_noise=noise))[0] for noise in (1e-4, 5e-3)]
     longest = [max(window.time[-1] - window.time[0] for window in of_kind(windows, kind)) for windows in found for kind in ('dynamic', 'static')]
-    assert longest[0] <= SHORTEST + 0.01 and longest[2] > 10.0 and min(longest[1], longest[3]) > 7.0
+    assert longest[0] <= MIN_MOVING_SECONDS + 0.01 and longest[2] > 10.0 and min(longest[1], longest[3]) > 7.0

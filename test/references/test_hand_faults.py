@@ -21,7 +21,7 @@ from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions, hand_options
-from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, UPPER
+from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, UPPER_TERMS
 from imu_calibration.references.gravity.poses import average_poses
 from imu_calibration.references.gravity.turns import at_range_end, rising, sample_times
 from imu_calibration.references.options import CalibrationOptions
@@ -298,7 +298,7 @@ def test_the_error_budget_lists_an_unknown_gravity_under_gravity_and_the_given_s
     assert budgets[1].causes['gravity'][scale] < 0.1 * budgets[0].causes['gravity'][scale]
     assert unknown.calibration.common_scale['status'] == 'weak' and given.calibration.common_scale == {}
     assert unknown.calibration.status == given.calibration.status and unknown.calibration.status[scale] == 'determined'
-    assert [name for name, status in unknown.calibration.status_by_name.items() if status == 'fixed'] == list(UPPER)
+    assert [name for name, status in unknown.calibration.status_by_name.items() if status == 'fixed'] == list(UPPER_TERMS)
 
 
 def test_an_unknown_gravity_does_not_change_the_recommended_poses():

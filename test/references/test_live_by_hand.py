@@ -12,7 +12,7 @@ from test_by_hand import GRAVITY, load, simulate
 from imu_calibration.calibration.advice import missing_motion
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.live_poses import LiveByHand
-from imu_calibration.calibration.pose_scan import FACES, unseen
+from imu_calibration.calibration.pose_scan import FACE_DIRECTIONS, unseen
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -116,22 +116,22 @@ def test_before_any_motion_it_asks_for_attitudes():
     with refused(NotObservableError, 'no_samples', 4):
         live.solve()
     status = live.status()
-    assert status.word == 'waiting' and re.search(r'[+-][xyz] up', status.message) and set(unseen(live.found)) == set(FACES)
+    assert status.word == 'waiting' and re.search(r'[+-][xyz] up', status.message) and set(unseen(live.found)) == set(FACE_DIRECTIONS)
     assert all(group.status == 'waiting' and group.needs for group in live.groups())
 
 
 def test_the_direction_that_is_missing_is_named():
     """Faces up one after the other: those that have not been up are named beside the step of the picture."""
-    ups = [FACES[name] for name in ('+z', '+x', '-z', '+y', '-x', '-y')]
+    ups = [FACE_DIRECTIONS[name] for name in ('+z', '+x', '-z', '+y', '-x', '-y')]
     imu = simulate(5, n_poses=6, attitudes=[Rotation.from_matrix(stand_up(up)) for up in ups])[0]
     live, asked = make_live(), {}
     for block in blocks(imu):
         live.push(block)
         asked[live.found.attitudes] = live.status(), unseen(live.found)
         assert f'next: {live.coverage().next.text}' in live.status().message
-    assert {name for name, count in ((n, k) for k in asked for n in asked[k][1])} == set(FACES)
-    assert asked[1][1][0] == '-z' and set(asked[1][1]) == set(FACES) - {'+z'}
-    assert set(asked[2][1]) == set(FACES) - {'+z', '+x'}
+    assert {name for name, count in ((n, k) for k in asked for n in asked[k][1])} == set(FACE_DIRECTIONS)
+    assert asked[1][1][0] == '-z' and set(asked[1][1]) == set(FACE_DIRECTIONS) - {'+z'}
+    assert set(asked[2][1]) == set(FACE_DIRECTIONS) - {'+z', '+x'}
     assert asked[6][1] == []
     status = asked[2][0]
     assert status.values['directions of gravity not seen'].split() == asked[2][1]

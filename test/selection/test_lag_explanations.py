@@ -7,7 +7,15 @@ import pytest
 
 from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.selection import lag_explanations
-from imu_calibration.selection.lag_explanations import COMMON, Explanation, LagExplanations, _Option, _rivals, _told_together, simplest
+from imu_calibration.selection.lag_explanations import (
+    MAX_CLOCK_LOSS,
+    Explanation,
+    LagExplanations,
+    _Option,
+    _rivals,
+    _told_together,
+    simplest,
+)
 from imu_calibration.selection.search import TIE
 
 
@@ -27,7 +35,7 @@ def test_a_delay_is_told_before_a_filter_and_fewer_effects_before_more():
 
 @pytest.mark.parametrize('silent, told', [(None, 'accel_delay'), (1e4, 'time_offset'), (1e3, 'accel_delay')])
 def test_where_nothing_rests_a_shared_clock_may_be_behind_by_a_share_of_what_lags_explain(silent, told):
-    explanations = [explanation(0.0, accel_delay=9e-3, gyro_filter=11e-3), explanation(0.5 * COMMON * 1e4, time_offset=9e-3, gyro_bandwidth=3e-3)]
+    explanations = [explanation(0.0, accel_delay=9e-3, gyro_filter=11e-3), explanation(0.5 * MAX_CLOCK_LOSS * 1e4, time_offset=9e-3, gyro_bandwidth=3e-3)]
     assert next(iter(simplest(explanations, silent).lags)) == told
 
 

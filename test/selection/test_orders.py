@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.selection.spectrum import MOST, OUT, orders_of
+from imu_calibration.selection.spectrum import MIN_ORDER_SHARE, OUT, orders_of
 
 TIME = 0.01 * np.arange(1200)
 
@@ -35,7 +35,7 @@ class Window(SimpleNamespace):
 def seen(rest_of):
     orders = orders_of(*swings(rest_of), 0)
     return [(int(order), axis) for at, order in enumerate(orders.order) for axis in range(3)
-            if orders.p_value[at, axis] < 1e-7 and orders.power[at, axis] > OUT and orders.share[at, axis] > MOST]
+            if orders.p_value[at, axis] < 1e-7 and orders.power[at, axis] > OUT and orders.share[at, axis] > MIN_ORDER_SHARE]
 
 
 def test_what_is_fixed_to_the_joint_is_found_in_swings_with_its_amplitude():

@@ -10,7 +10,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
-from imu_calibration.estimation.noise_search import FLICKER, BiasProcessSearch, NoiseLikelihood
+from imu_calibration.estimation.noise_search import FLICKER_MARK, BiasProcessSearch, NoiseLikelihood
 from imu_calibration.selection import gain, investigation
 from imu_calibration.selection import unexplained as rests
 from imu_calibration.selection.attempt import Attempt
@@ -19,7 +19,7 @@ from imu_calibration.selection.explained_share import SHOWS, Explained, Explaine
 from imu_calibration.selection.noise_beside_effects import _needed_smooth, drift_prior, natural_processes, plausible_processes
 from imu_calibration.selection.parameter_space import ParameterSpace, parameter_space, scatter_of_each, white_means
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.search import LEAST_GAIN, Search
+from imu_calibration.selection.search import MIN_GAIN_NATS, Search
 
 KINDS = np.array(['static'] * 20 + ['spin'] * 12)
 
@@ -67,8 +67,8 @@ def test_among_many_effects_one_is_significant_by_chance():
 
 
 def test_a_finding_predicts_what_it_was_not_fitted_to():
-    assert scored(2 * (LEAST_GAIN + 1)).significant
-    assert not scored(2 * (LEAST_GAIN - 1)).significant
+    assert scored(2 * (MIN_GAIN_NATS + 1)).significant
+    assert not scored(2 * (MIN_GAIN_NATS - 1)).significant
     assert not scored(-10.0).significant
 
 
@@ -158,7 +158,7 @@ def test_rests_are_told_of_where_no_other_measure_falls_for_sure(monkeypatch):
     """Moving windows of a quiet sensor show the encoder."""
     monkeypatch.setattr(gain, '_squares', Squares.of)
     unsure = np.where(np.arange(30) % 3, 0.001, 3.0)
-    for within, measure in ((1.0, gain.AT_REST), (0.99, 'samples about the mean of their window')):
+    for within, measure in ((1.0, gain.REST_MEASURE), (0.99, 'samples about the mean of their window')):
         some = Squares(within, unsure)
         some.all_samples = (*some.all_samples, 0.02 if within == 1.0 else 0.001)
         assert gain.gain_in_turn(some, [], [QUADRATIC], sensors=['accelerometer']).measure == measure
@@ -166,9 +166,9 @@ def test_rests_are_told_of_where_no_other_measure_falls_for_sure(monkeypatch):
 
 def test_a_recording_without_rests_says_nothing_of_them(monkeypatch):
     """All measures rise; that of no windows at all does not, and must not stand for a fall."""
-    monkeypatch.setattr(gain, '_squares', lambda *args: Squares.of(*args) | {gain.AT_REST: (np.zeros(0), np.zeros(0))})
+    monkeypatch.setattr(gain, '_squares', lambda *args: Squares.of(*args) | {gain.REST_MEASURE: (np.zeros(0), np.zeros(0))})
     found = gain.gain_in_turn(Squares(1.2, 1.2), [], [QUADRATIC], sensors=['accelerometer'])
-    assert found.measure != gain.AT_REST and found.ci95[0] < 0
+    assert found.measure != gain.REST_MEASURE and found.ci95[0] < 0
 
 
 def test_an_interval_of_95_percent_holds_95_percent():
@@ -400,11 +400,11 @@ def test_what_a_drift_does_within_windows_is_predicted_and_tells_nothing_of_it()
 def test_flicker_is_as_much_of_each_time():
     likelihood = NoiseLikelihood.__new__(NoiseLikelihood)
     likelihood.known = ()
-    made = likelihood.processes(3.0, FLICKER)
+    made = likelihood.processes(3.0, FLICKER_MARK)
     assert len(made) > 3 and len({process.sd for process in made}) == 1 and sum(process.sd**2 for process in made) == pytest.approx(9.0)
     assert likelihood.processes(3.0, 40.0) == (BiasProcess(3.0, 40.0),)
-    likeliest = SimpleNamespace(typical=1.0, many=True, loss=lambda shape, used: 100.0 - 5.0 * (shape[2] == FLICKER))
-    assert BiasProcessSearch(likeliest, 1.0).best([])[0] == (0.0, 1.0, FLICKER)
+    likeliest = SimpleNamespace(typical=1.0, many=True, loss=lambda shape, used: 100.0 - 5.0 * (shape[2] == FLICKER_MARK))
+    assert BiasProcessSearch(likeliest, 1.0).best([])[0] == (0.0, 1.0, FLICKER_MARK)
 
 
 def test_a_usual_wander_has_no_price():

@@ -13,17 +13,17 @@ import pytest
 from imu_calibration.calibration.coverage import line_of
 from imu_calibration.cli.main import main
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.document.calibration import UNKNOWN
+from imu_calibration.document.calibration import UNKNOWN_SD
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.diagnose import diagnose
 from imu_calibration.use_cases.view import (
-    PARAMETERS,
-    RESIDUAL,
+    PARAMETERS_TOPIC,
+    RESIDUAL_TOPIC,
     SCHEMAS,
-    SPECTRUM,
-    SPHERE,
+    SPECTRUM_TOPIC,
+    SPHERE_TOPIC,
     _coverage,
     _from_x,
     residual_spectrum,
@@ -74,13 +74,13 @@ def shown_of(written, topic):
 
 def test_every_topic_has_its_schema(written):
     assert {topic: (name, encoding) for topic, (name, encoding, _) in written.items()} == {
-        **{topic: (SCHEMAS[topic]['title'], 'json') for topic in (PARAMETERS, RESIDUAL, SPECTRUM)}, SPHERE: ('foxglove.SceneUpdate', 'protobuf')}
+        **{topic: (SCHEMAS[topic]['title'], 'json') for topic in (PARAMETERS_TOPIC, RESIDUAL_TOPIC, SPECTRUM_TOPIC)}, SPHERE_TOPIC: ('foxglove.SceneUpdate', 'protobuf')}
 
 
 def test_residuals_are_those_of_the_windows_at_their_time(written, result):
-    errors, windows = result.window_errors(), shown_of(written, RESIDUAL)['windows']
+    errors, windows = result.window_errors(), shown_of(written, RESIDUAL_TOPIC)['windows']
     order = np.argsort(errors.time, kind='stable')
-    assert [row['time'] for row in windows] == list(errors.time[order]) and written[RESIDUAL][2][1][0] == pytest.approx(errors.time.max())
+    assert [row['time'] for row in windows] == list(errors.time[order]) and written[RESIDUAL_TOPIC][2][1][0] == pytest.approx(errors.time.max())
     for which in ('before', 'after', 'floor'):
         for sensor in SENSORS:
             shown = np.array([[row[which][sensor][axis] for axis in 'xyz'] for row in windows])
@@ -88,7 +88,7 @@ def test_residuals_are_those_of_the_windows_at_their_time(written, result):
 
 
 def test_parameters_have_value_band_and_tolerance(written, result):
-    rows, calibration = shown_of(written, PARAMETERS)['parameters'], result.calibration
+    rows, calibration = shown_of(written, PARAMETERS_TOPIC)['parameters'], result.calibration
     assert [row['name'] for row in rows] == list(calibration.param_names)
     assert [row['ratio'] for row in rows] == pytest.approx(calibration.sd / result.tolerances)
     for name, wanted in (('value', calibration.values), ('sd', calibration.sd), ('tolerance', result.tolerances),
@@ -98,14 +98,14 @@ def test_parameters_have_value_band_and_tolerance(written, result):
 
 
 def test_the_sphere_says_what_is_next_and_shows_every_cell_and_rest(written, result):
-    scene, found = shown_of(written, SPHERE), _coverage(result)
+    scene, found = shown_of(written, SPHERE_TOPIC), _coverage(result)
     drawn = str(scene_of(found, 'imu_link'))
     assert scene == scene_of(found, result.calibration.frame_id).encode() and line_of(found).encode() in scene
     assert drawn.count('SpherePrimitive') == 26 + (result.window_errors().kind == 'static').sum()
 
 
 def test_spectrum_is_that_of_the_residuals(written, result):
-    shown = shown_of(written, SPECTRUM)
+    shown = shown_of(written, SPECTRUM_TOPIC)
     frequency, density = residual_spectrum(result, result.gathered.kept)
     assert [line['frequency'] for line in shown['lines']] == list(frequency) and len(frequency) > 30
     assert np.array_equal([[line['gyroscope'][axis] for axis in 'xyz'] for line in shown['lines']], density['gyroscope'])
@@ -129,7 +129,7 @@ def test_an_arrow_points_where_it_shall(along):
 
 
 def test_of_imported_values_no_band_is_shown(tmp_path, result):
-    imported = replace(result.calibration, provenance=result.calibration.provenance | {'uncertainty': UNKNOWN})
+    imported = replace(result.calibration, provenance=result.calibration.provenance | {'uncertainty': UNKNOWN_SD})
     (tmp_path / 'calibration.yaml').write_text(calibration_to_text(imported))
     [shown] = view(tmp_path).contents.values()
     assert len(shown['parameters']) == len(imported.values) and not {'sd', 'low', 'high', 'ratio'} & set(shown['parameters'][0])
@@ -137,7 +137,7 @@ def test_of_imported_values_no_band_is_shown(tmp_path, result):
 
 def test_by_hand_there_are_poses_and_a_sphere_but_no_spectrum():
     shown = view(SampleBlock(simulate(3)[0]), gravity=GRAVITY)
-    assert set(shown.contents) == {PARAMETERS, RESIDUAL} and len(shown.contents[RESIDUAL]['windows']) == len(shown.coverage.seen) >= 9
+    assert set(shown.contents) == {PARAMETERS_TOPIC, RESIDUAL_TOPIC} and len(shown.contents[RESIDUAL_TOPIC]['windows']) == len(shown.coverage.seen) >= 9
     assert 'spectrum' in shown.lacks[0]
 
 
@@ -146,7 +146,7 @@ def test_of_a_calibration_file_the_parameters_alone_are_shown(tmp_path, result, 
     (tmp_path / 'calibration.yaml').write_text(calibration_to_text(result.calibration))
     assert main(['view', str(tmp_path), '--output', str(tmp_path / 'view.mcap')]) == 0
     assert 'warning: ' in capsys.readouterr().err
-    assert set(read(tmp_path / 'view.mcap')) == {PARAMETERS}
+    assert set(read(tmp_path / 'view.mcap')) == {PARAMETERS_TOPIC}
     assert main(['view', str(tmp_path), '--table', TABLE, '--output', str(tmp_path / 'other.mcap')]) == 1
     assert 'recording' in capsys.readouterr().err and not (tmp_path / 'other.mcap').exists()
 
@@ -164,7 +164,7 @@ def test_the_layout_asks_for_what_the_file_holds(written):
     text = (ROOT / 'config/view.foxglove.json').read_text()
     asked = set(re.findall(r'"(/imu/[^"]+)"', text))
     assert {path.partition('.')[0] for path in asked} == set(written)
-    for path in asked - {SPHERE}:
+    for path in asked - {SPHERE_TOPIC}:
         topic, *names = path.replace('[:]', '').split('.')
         found = shown_of(written, topic)
         for name in names:

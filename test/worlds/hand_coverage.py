@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.calibration.hand_by_evidence import solve_by_evidence
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.covariance_terms import HELD, of_fit
+from imu_calibration.estimation.covariance_terms import HELD_PRIORS, of_fit
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions
 
@@ -37,7 +37,7 @@ def errors(world, seed, **options):
         if not any(effect.sensor == sensor and effect.time_constant for effect in hand.hand_model.extras):   # a bias beside a drift is that of the start, else a mean
             truth[part] += moved[sensor]
     places = [hand.param_names.index(name) for name in PARAM_NAMES[:21]]
-    fit = of_fit(hand.terms) + hand.terms[HELD]
+    fit = of_fit(hand.terms) + hand.terms[HELD_PRIORS]
     grown = hand.sd[places] / np.sqrt(np.maximum(np.diag(fit)[places], 1e-30))
     off, sd = hand.values[places] - truth[:21], hand.sd[places]
     return {group: (off[part], sd[part], grown[part]) for group, part in GROUPS.items()}

@@ -13,9 +13,9 @@ from scipy.stats import chi2
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
-from imu_calibration.selection.evidence import FOLDS
+from imu_calibration.selection.evidence import EVIDENCE_FOLDS
 from imu_calibration.selection.investigation import investigate
-from imu_calibration.selection.search import FAMILY_WISE, LEAST_GAIN, PENALTY, least_angle
+from imu_calibration.selection.search import FAMILY_WISE, MIN_GAIN_NATS, PENALTY, least_angle
 
 from worlds import physics
 from worlds.physics_draw import EFFECTS, POSITIVE, draw_value, generator
@@ -94,13 +94,13 @@ def passing(noncentrality, n_parameters, n_questions, draws=4000):
     The chi-square test over all questions, the gain of held-out log likelihood with its least value and its penalty for each parameter, and the fall of the residual from
     window to window in the unit of the sensor, for sure (95 %). Shares of a rest and halves are no part of it.
     """
-    noise = np.random.default_rng(1).normal(size=(draws, FOLDS, n_parameters)) * np.sqrt(FOLDS)
+    noise = np.random.default_rng(1).normal(size=(draws, EVIDENCE_FOLDS, n_parameters)) * np.sqrt(EVIDENCE_FOLDS)
     parts = noise + np.sqrt(noncentrality) * np.eye(1, n_parameters)[0]
     whole = parts.mean(axis=1)
-    others = (FOLDS * whole[:, None] - parts) / (FOLDS - 1)
+    others = (EVIDENCE_FOLDS * whole[:, None] - parts) / (EVIDENCE_FOLDS - 1)
     gain = 0.5 * ((parts**2).sum(axis=2) - ((parts - others)**2).sum(axis=2)).mean(axis=1)
     fall = (whole**2).sum(axis=1)
-    return ((chi2.sf(fall, n_parameters) * n_questions < FAMILY_WISE) & (gain > max(LEAST_GAIN, PENALTY * n_parameters)) & (gain > 1.96 * np.sqrt(fall)))
+    return ((chi2.sf(fall, n_parameters) * n_questions < FAMILY_WISE) & (gain > max(MIN_GAIN_NATS, PENALTY * n_parameters)) & (gain > 1.96 * np.sqrt(fall)))
 
 
 class Sizes:

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.estimation.accumulator import Accumulator
-from imu_calibration.estimation.covariance_terms import HELD, of_fit
+from imu_calibration.estimation.covariance_terms import HELD_PRIORS, of_fit
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.options import CalibrationOptions, choose_model
-from imu_calibration.selection.questions import PASSES, linearise_again
+from imu_calibration.selection.questions import MAX_TABLE_PASSES, linearise_again
 
 from worlds.misfit_worlds import CAUSES, make_pair
 
@@ -46,7 +46,7 @@ def calibrated(session, options=OPTIONS):
     gatherer = MotionGatherer(table)
     windows = gatherer.push(session.block) + gatherer.finish()
     model = choose_model(options, table)
-    for _ in range(PASSES):
+    for _ in range(MAX_TABLE_PASSES):
         accumulator = Accumulator()
         for row in reduce_windows(windows, model, table):
             accumulator.add(row)
@@ -60,7 +60,7 @@ def calibrated(session, options=OPTIONS):
 
 def base_sd(solution):
     """Return the standard deviations that noise alone gives, shape (n_params,)."""
-    return np.sqrt(np.diag(of_fit(solution.terms) + solution.terms[HELD]))
+    return np.sqrt(np.diag(of_fit(solution.terms) + solution.terms[HELD_PRIORS]))
 
 
 def errors_in_sd(found):

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.documents import json_types
-from imu_calibration.effects.base import SENSORS, UNIT
+from imu_calibration.effects.base import SENSORS, UNITS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.gain import Gain
@@ -126,13 +126,13 @@ def parameters_of(solution: Solution, sensor: str, effect: str) -> dict[str, tup
             for k, (name, value, spread) in enumerate(zip(declared.param_names(), solution.values[part], sd))}
 
 
-FORMAT = 'imu_calibration/diagnosis/1'
+DIAGNOSIS_FORMAT = 'imu_calibration/diagnosis/1'
 
 
 def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the content of diagnosis.json: plain dicts, lists, strings and numbers, None for NaN and infinity."""
     return json_types({
-        'format': FORMAT,
+        'format': DIAGNOSIS_FORMAT,
         'baseline': {sensor: _baseline(diagnosis.baseline, sensor) for sensor in SENSORS},
         'onset': None if diagnosis.onset is None else diagnosis.onset.to_mapping(),
         'findings': [_finding(finding) for finding in diagnosis.findings],
@@ -174,7 +174,7 @@ def _gain(gain):
 
 
 def _rest(sensor, rest, locked):
-    unit = rest.unit or UNIT[sensor]
+    unit = rest.unit or UNITS[sensor]
     return {'significant': rest.significant, 'rms': rest.rms, 'unit': unit, 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
             'share': rest.share, 'where': '; '.join(regime.text for regime in rest.regimes) or None, 'axes': list(rest.axes),
             'regimes': [regime.to_mapping() for regime in rest.regimes], 'tones': [tone.to_mapping() for tone in rest.tones],

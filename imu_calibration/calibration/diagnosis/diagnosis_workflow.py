@@ -18,7 +18,7 @@ from imu_calibration.calibration.table_calibration import conclude, solve_record
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.verdict import misfits, unsteady
-from imu_calibration.effects.base import SENSORS, UNIT, Effect, Role
+from imu_calibration.effects.base import SENSORS, UNITS, Effect, Role
 from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
 from imu_calibration.kinematics.table import Table
@@ -232,4 +232,4 @@ def nothing_named(diagnosis: Diagnosis) -> str:
 
 def in_words(value: float, sensor: str, unit: str | None = None) -> str:
     """Return a specific force or rate, or a value in another unit, in people's units."""
-    return error_text(value, unit or UNIT[sensor])
+    return error_text(value, unit or UNITS[sensor])

@@ -17,9 +17,9 @@ from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.model_selection import HandInvestigation
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regime_variables import Variable, ranged
-from imu_calibration.selection.regimes import BY_CHANCE, AxisResidual, RegimeSearch, RestRegime, exchanges
+from imu_calibration.selection.regimes import REGIME_LEVEL, AxisResidual, RegimeSearch, RestRegime, exchanges
 from imu_calibration.selection.residual_fit import LEAST_OF_AXIS
-from imu_calibration.selection.unexplained import LEAST_WINDOWS, SIGNIFICANT, Unexplained, correlate, slow_explanations
+from imu_calibration.selection.unexplained import MIN_EXPLAINED_WINDOWS, SIGNIFICANT_SDS, Unexplained, correlate, slow_explanations
 
 NORM = 'norm'
 """Without a table only the component of the accelerometer's error along gravity is observable."""
@@ -48,7 +48,7 @@ def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -
     for axis, name in enumerate(names):
         sd = np.sqrt(block.floor[:, axis])
         rest = AxisResidual(np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None], np.zeros(1), np.zeros(1))
-        found += search.offsets(name, rest, partial(np.multiply, 1.0 / sd[:, None]), level=BY_CHANCE / len(names))[:1]
+        found += search.offsets(name, rest, partial(np.multiply, 1.0 / sd[:, None]), level=REGIME_LEVEL / len(names))[:1]
     return tuple(found)
 
 
@@ -65,7 +65,7 @@ def _variables(hand: HandCalibration, block: Block) -> list[Variable]:
     return found if warm is None else found + of('temperature', warm[block.pose], 'C', least=0.5)
 
 
-PER_TURN = 'rad/turn'
+TURN_RESIDUAL_UNIT = 'rad/turn'
 """Unit of the residual of turns: the angle between predicted and measured gravity after a turn."""
 
 
@@ -103,7 +103,7 @@ def rest_of(hand: HandCalibration, inquiry: Any, named: Sequence[Question], *, s
         if spare < 3:
             continue
         own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
-        if block.name == 'poses' or own > max(sigma, SIGNIFICANT):
+        if block.name == 'poses' or own > max(sigma, SIGNIFICANT_SDS):
             size = 1.0 if block.duration is None else block.duration[:, None]**2   # the residual of a turn is an angle, of a pose a rate
             excess = np.sum(residual**2 * size) / spare - np.mean(block.floor * size)
             if own > sigma:
@@ -111,8 +111,8 @@ def rest_of(hand: HandCalibration, inquiry: Any, named: Sequence[Question], *, s
     count = len(hand.poses.start)
     first = next(k for k, block in enumerate(inquiry.blocks) if block.sensor == sensor)
     layers, noise_sd = residuals[first], np.sqrt(inquiry.blocks[first].floor)
-    significant = bool(sigma > SIGNIFICANT and count >= LEAST_WINDOWS)
-    unit = None if chosen is None or chosen.duration is None else PER_TURN
+    significant = bool(sigma > SIGNIFICANT_SDS and count >= MIN_EXPLAINED_WINDOWS)
+    unit = None if chosen is None or chosen.duration is None else TURN_RESIDUAL_UNIT
     if not significant:
         return Unexplained(False, rms, float(max(sigma, -99.0)), None, 0.0, layers, noise_sd, unit)
     name, share = correlate(_explanations(hand), layers / noise_sd)

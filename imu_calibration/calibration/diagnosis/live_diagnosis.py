@@ -11,7 +11,7 @@ from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.session import LiveSnapshot, TableSession
 from imu_calibration.core.errors import ImuCalibrationError
-from imu_calibration.selection.evidence import LEAST_WINDOWS
+from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.investigation import too_few_windows
 
 
@@ -32,7 +32,7 @@ class Outcome(StrEnum):
     """It ended by a fault."""
 
 
-MATES, SIZE = 'mates of ', 'size of '
+MATES_KEY, SIZE_KEY = 'mates of ', 'size of '
 """Prefix of the name of each finding, and of EFFECT.PARAMETER with a number in SI: for programs."""
 WAITING, OFF, FOUND, NOTHING, UNEXPLAINED, FAILED = Outcome
 
@@ -43,7 +43,7 @@ class DiagnosisState:
 
     word: Outcome = WAITING
     """Outcome."""
-    message: str = f'it follows a solution of at least {LEAST_WINDOWS} windows'
+    message: str = f'it follows a solution of at least {MIN_FOLD_WINDOWS} windows'
     """One line."""
     values: dict = field(default_factory=dict)
     """Figures by name."""
@@ -111,7 +111,7 @@ def describe(diagnosis: Diagnosis) -> DiagnosisState:
               'further findings': ' '.join(finding.effect for finding in diagnosis.findings[1:]),
               'implausible': ' '.join(finding.effect for finding in diagnosis.findings if finding.implausible), **values}
     for finding in diagnosis.findings:
-        values[MATES + finding.effect] = ' '.join(finding.indistinguishable_from)
+        values[MATES_KEY + finding.effect] = ' '.join(finding.indistinguishable_from)
         sized = {finding.effect: finding.parameters, **finding.sizes_of_mates}
-        values |= {f'{SIZE}{effect}.{name}': repr(float(value)) for effect, sizes in sized.items() for name, (value, *_) in sizes.items()}
+        values |= {f'{SIZE_KEY}{effect}.{name}': repr(float(size)) for effect, sizes in sized.items() for name, (size, *_) in sizes.items()}
     return DiagnosisState(FOUND, message, values)

@@ -16,7 +16,7 @@ from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import FAMILY_WISE, Score, Search
 
-ENOUGH = 9.0
+MIN_EVIDENCE_GROWTH = 9.0
 """Least growth of the evidence that a motion must promise, in squared standard deviations."""
 
 
@@ -62,7 +62,7 @@ def _best_motion(solution, question, mate, gravity):
     values = np.where(np.isfinite(values), values, 0.0)
     prior_sd = np.where(model.prior()[1] > 0, model.prior()[1], 1.0)
     own = model.slices[question.sensor, question.name]
-    best = (ENOUGH, None)
+    best = (MIN_EVIDENCE_GROWTH, None)
     for motion in MOTIONS:
         total = np.diag(1 / prior_sd**2) + added_information(model, values, solution.noise, motion=motion, gravity=gravity)
         left = _unimitated(total, values, own)

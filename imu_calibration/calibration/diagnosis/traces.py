@@ -19,9 +19,9 @@ from imu_calibration.simulation.session import predict_windows
 
 PER_DECADE = 6
 """Frequency bands of the spectrum per decade."""
-LOWEST, HIGHEST = -2, 5
+LOWEST_DECADE, HIGHEST_DECADE = -2, 5
 """Decades of the lowest and highest edge, Hz."""
-EDGES = 10.0**np.linspace(LOWEST, HIGHEST, (HIGHEST - LOWEST) * PER_DECADE + 1)
+BAND_EDGES = 10.0**np.linspace(LOWEST_DECADE, HIGHEST_DECADE, (HIGHEST_DECADE - LOWEST_DECADE) * PER_DECADE + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class DistanceSums:
     """Accumulates the residual power of windows; memory does not grow with the recording."""
 
     def __init__(self) -> None:
-        count = len(EDGES) - 1
+        count = len(BAND_EDGES) - 1
         self._power = {sensor: np.zeros((2, count, 3)) for sensor in SENSORS}
         self._rest = {sensor: np.zeros((count, 3)) for sensor in SENSORS}
         self._means = {sensor: np.zeros((2, 3)) for sensor in SENSORS}
@@ -92,10 +92,10 @@ class DistanceSums:
         if n < 4 or not window.period:
             return
         line = np.fft.rfftfreq(n, window.period)[1:]
-        place = np.clip(np.searchsorted(EDGES, line, side='right') - 1, 0, len(EDGES) - 2)
+        place = np.clip(np.searchsorted(BAND_EDGES, line, side='right') - 1, 0, len(BAND_EDGES) - 2)
         freedom = np.full(len(line), 2.0)
         freedom[-1] = 1.0 if n % 2 == 0 else 2.0
-        self._freedom[:2 if rest else 1] += np.bincount(place, freedom, len(EDGES) - 1)
+        self._freedom[:2 if rest else 1] += np.bincount(place, freedom, len(BAND_EDGES) - 1)
         self._samples += n
         self._windows += 1
         for sensor in SENSORS:
@@ -104,7 +104,7 @@ class DistanceSums:
             for k, own in enumerate(residuals):
                 mean = own[sensor].mean(axis=0)
                 squares = np.abs(np.fft.rfft(own[sensor], axis=0)[1:])**2 * freedom[:, None] / n
-                band = np.stack([np.bincount(place, column, len(EDGES) - 1) for column in squares.T], axis=1)
+                band = np.stack([np.bincount(place, column, len(BAND_EDGES) - 1) for column in squares.T], axis=1)
                 self._power[sensor][k] += band
                 self._means[sensor][k] += mean**2
                 row += [band.sum(), mean @ mean]
@@ -122,7 +122,7 @@ class DistanceSums:
         density = self._rest[sensor][known] / self._freedom[1][known, None]
         nearest = np.abs(np.arange(edge - 1)[:, None] - known).argmin(axis=1) if len(known) else []
         noise = density[nearest] * self._freedom[0][:edge - 1, None] if len(known) else np.zeros((edge - 1, 3))
-        return Distance(EDGES[:edge], self._power[sensor][:, :edge - 1] / self._samples, noise / self._samples,
+        return Distance(BAND_EDGES[:edge], self._power[sensor][:, :edge - 1] / self._samples, noise / self._samples,
                         self._means[sensor] / self._windows, self._noise[sensor] / self._windows, self.gains(sensor))
 
     def gains(self, sensor: str, of: str = OF_MODEL) -> dict[str, Gain]:
@@ -137,11 +137,11 @@ class DistanceSums:
         return found
 
 
-BLOCK = 0.25
+PLOT_BLOCK_SECONDS = 0.25
 """Residuals are averaged over this time for plots, s."""
 DEAD_RECKONING = 50.0
 """Length of dead reckoning, s."""
-GAP = 0.1
+MAX_STRETCH_STEP = 0.1
 """Longest step between samples of a stretch, s."""
 MOST_STRETCHES = 12
 """Stretches of dead reckoning, evenly spread over a longer recording."""
@@ -235,7 +235,7 @@ def _largest(time, residual):
     sums = np.concatenate([[0.0], np.cumsum(residual**2)])
     stop = np.searchsorted(time, time + SEGMENT)
     first = int(np.argmax(sums[stop] - sums[:-1]))
-    return time[first] - BLOCK, time[first] + SEGMENT
+    return time[first] - PLOT_BLOCK_SECONDS, time[first] + SEGMENT
 
 
 def _segment(windows, table, models, sensor, axis, start, stop):
@@ -272,7 +272,7 @@ def _references(model, table, motion, temperature):
 
 def _blocks(windows):
     """Return the block of each sample, the number of samples of each block and of blocks of each window; blocks end with their window."""
-    places = [np.unique(((window.time - window.time[0]) / BLOCK).astype(int), return_inverse=True)[1] for window in windows]
+    places = [np.unique(((window.time - window.time[0]) / PLOT_BLOCK_SECONDS).astype(int), return_inverse=True)[1] for window in windows]
     n_blocks = [int(place[-1]) + 1 for place in places]
     block = np.concatenate([start + place for start, place in zip(np.cumsum([0, *n_blocks]), places)])
     return block, np.bincount(block), n_blocks
@@ -288,7 +288,7 @@ def _dead_reckoning(windows, table, models):
     """Return medians over stretches of 50 s without gaps, or None."""
     stretches, run = [], []
     for window in windows:
-        if run and not 0 < window.time[0] - run[-1].time[-1] <= GAP:
+        if run and not 0 < window.time[0] - run[-1].time[-1] <= MAX_STRETCH_STEP:
             run = []
         run.append(window)
         if window.time[-1] - run[0].time[0] > DEAD_RECKONING:

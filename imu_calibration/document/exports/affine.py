@@ -156,7 +156,7 @@ def moved(imu: AffineImu, to: Placement) -> AffineImu:
 
 
 PUBLISHER = 'static_transform_publisher'
-NUMBERS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
+POSE_NUMBERS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
 PARENT, CHILD = 'frame-id', 'child-frame-id'
 UNNAMED = 'sensor_frame'
 """Name of the sensor frame where the calibration has none."""
@@ -165,7 +165,7 @@ UNNAMED = 'sensor_frame'
 def pose_line(placement: Placement, parent: str, child: str) -> str:
     """Return the transform with the arguments of the program of tf2_ros, with all digits."""
     values = [*placement.origin_s, *Rotation.from_matrix(placement.mat_ts.T).as_quat()]
-    pose: dict[str, str] = {name: repr(float(value)) for name, value in zip(NUMBERS, values)}
+    pose: dict[str, str] = {name: repr(float(value)) for name, value in zip(POSE_NUMBERS, values)}
     return ' '.join([PUBLISHER, *(f'--{name} {shlex.quote(value)}' for name, value in (pose | {PARENT: parent, CHILD: child}).items())])
 
 
@@ -175,7 +175,7 @@ def find_pose(content: bytes) -> tuple[Placement, str] | None:
     try:
         words = shlex.split(line.group(1).partition('"')[0]) if line else []
         options = {name.removeprefix('--'): value for name, value in zip(words, words[1:], strict=False) if name.startswith('--')}
-        values = np.array([float(options[name]) for name in NUMBERS])
+        values = np.array([float(options[name]) for name in POSE_NUMBERS])
         parent = options[PARENT]
     except (KeyError, ValueError):
         return None

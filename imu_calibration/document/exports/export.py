@@ -18,10 +18,10 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import to_mapping
 from imu_calibration.document.exports import targets
 from imu_calibration.document.exports.affine import ARMS, MATRICES, UNNAMED, AffineImu, Placement, affine_of, moved, pose_line
-from imu_calibration.document.exports.loss import NOTHING, Loss, TrialMotion, loss_of, standard_motion
+from imu_calibration.document.exports.loss import ROUNDING_LOSS, Loss, TrialMotion, loss_of, standard_motion
 from imu_calibration.document.exports.target import Noise, Numbers, Page, Readings, Target
 from imu_calibration.document.trust import Usable, caveats, usable
-from imu_calibration.effects.base import SENSORS, UNIT, Role
+from imu_calibration.effects.base import SENSORS, UNITS, Role
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +177,7 @@ def _worked_sample(target, numbers, placement, calibration) -> list[str]:
 def loss_lines(target: Target, loss: Loss) -> list[str]:
     """Return the losses, a line each."""
     if target.only_noise:
-        left = ', '.join(f'{sensor} {error_text(value, UNIT[sensor])}' for sensor, value in loss.left.items())
+        left = ', '.join(f'{sensor} {error_text(value, UNITS[sensor])}' for sensor, value in loss.left.items())
         beside = ' in addition to a constant bias' if target.estimates else ''
         return ['accepts no calibration: use compensated readings (compensator_node, or the verb compensate)',
                 f'fed with raw readings it is left with an error of rms {left}{beside}, on {loss.motion}']
@@ -188,10 +188,10 @@ def loss_lines(target: Target, loss: Loss) -> list[str]:
         return [*lines, 'lost: nothing']
     for lost in loss.effects:
         what = 'held in part' if lost.in_part else 'lost'
-        lines.append(f'{what}: {lost.effect.sensor} {lost.effect.name}, {error_text(lost.rms, UNIT[lost.effect.sensor])} rms')
+        lines.append(f'{what}: {lost.effect.sensor} {lost.effect.name}, {error_text(lost.rms, UNITS[lost.effect.sensor])} rms')
     for sensor in SENSORS:
-        left, raw = (error_text(error[sensor], UNIT[sensor]) for error in (loss.left, loss.raw))
-        left = f'{left} rms' if loss.left[sensor] > NOTHING else 'none'
+        left, raw = (error_text(error[sensor], UNITS[sensor]) for error in (loss.left, loss.raw))
+        left = f'{left} rms' if loss.left[sensor] > ROUNDING_LOSS else 'none'
         lines.append(f'remaining error of the {sensor}: {left} (raw readings: {raw}), on {loss.motion}')
     return lines
 

@@ -12,7 +12,7 @@ from imu_calibration.compensation.stream import CompensationStream, derivative_f
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.document.calibration import UNKNOWN, Calibration
+from imu_calibration.document.calibration import UNKNOWN_SD, Calibration
 from imu_calibration.document.calibration_text import check_numbers, from_mapping
 from imu_calibration.document.decision import UNPROVEN
 from imu_calibration.document.exports.affine import (
@@ -33,12 +33,12 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import HELD, WEAK
 from imu_calibration.kinematics.rotations import Reference
 
-SECONDS, SAMPLES_PER_SECOND = 60.0, 50
-FREQUENCIES = np.array([0.3, 0.4, 0.5])
+SPIRAL_SECONDS, SAMPLES_PER_SECOND = 60.0, 50
+RATE_FREQUENCIES = np.array([0.3, 0.4, 0.5])
 """Hz; of the rates about x, y, z."""
 USUAL_RATE = 1.0
 """rad/s; default for a document without the speed of its motion."""
-TURNS = 15
+SPIRAL_TURNS = 15
 """Turns of the spiral of gravity from nadir to zenith."""
 
 
@@ -72,12 +72,12 @@ def standard_motion(calibration: Calibration) -> TrialMotion:
     largest = conditions.get('largest_rate') or USUAL_RATE
     gravity = conditions.get('gravity')
     gravity = gravity if isinstance(gravity, float) and gravity > 0 else STANDARD_GRAVITY
-    time = np.arange(int(SECONDS * SAMPLES_PER_SECOND)) / SAMPLES_PER_SECOND
+    time = np.arange(int(SPIRAL_SECONDS * SAMPLES_PER_SECOND)) / SAMPLES_PER_SECOND
     height = np.linspace(-1.0, 1.0, len(time))
-    turn, level = 2 * np.pi * TURNS * time / SECONDS, np.sqrt(1.0 - height**2)
+    turn, level = 2 * np.pi * SPIRAL_TURNS * time / SPIRAL_SECONDS, np.sqrt(1.0 - height**2)
     force = gravity * np.stack([level * np.cos(turn), level * np.sin(turn), height], axis=1)
-    phase = 2 * np.pi * FREQUENCIES * time[:, None]
-    rate, alpha = largest * np.sin(phase), largest * 2 * np.pi * FREQUENCIES * np.cos(phase)
+    phase = 2 * np.pi * RATE_FREQUENCIES * time[:, None]
+    rate, alpha = largest * np.sin(phase), largest * 2 * np.pi * RATE_FREQUENCIES * np.cos(phase)
     low, high = conditions.get('temperature_range_c') or [calibration.model.temperature_ref_c] * 2
     temperature = np.linspace(low, high, len(time))
     warmth = f'{low:g} C' if low == high else f'{low:g} to {high:g} C'
@@ -116,7 +116,7 @@ def temperature_at(calibration: Calibration, temperature: TemperatureSamples | N
     return np.interp((stamp_ns - first) * 1e-9, (temperature.stamp_ns - first) * 1e-9, temperature.temperature_c)
 
 
-NOTHING = 1e-9
+ROUNDING_LOSS = 1e-9
 """m/s^2, rad/s; smaller differences are rounding."""
 
 
@@ -150,7 +150,7 @@ class Loss:
     @property
     def nothing(self) -> bool:
         """Whether the program's readings equal the full compensation."""
-        return not self.effects and max(self.left.values()) < NOTHING
+        return not self.effects and max(self.left.values()) < ROUNDING_LOSS
 
 
 def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, placement: Placement, motion: TrialMotion) -> Loss:
@@ -263,8 +263,8 @@ def _document(target: Target, found: Read, imu: AffineImu, axes: str, path: Any,
     reason = f'imported from {target.title} ({name}) without uncertainties, its error was not measured on a recording'
     statistics = {sensor: {'noise_sd': [value] * 3} for sensor, value in found.sample_sd.items()}
     conditions = {'temperature_range_c': list(imu.temperature_range_c)} if imu.temperature_range_c else {}
-    gauge = {'origin': 'mean_of_sensitive_points' if np.any(imu.arms) else UNKNOWN, 'axes': axes}
-    provenance = {'software': imu_calibration.__version__, 'imported': {'from': target.name, 'file': name}, 'uncertainty': UNKNOWN}
+    gauge = {'origin': 'mean_of_sensitive_points' if np.any(imu.arms) else UNKNOWN_SD, 'axes': axes}
+    provenance = {'software': imu_calibration.__version__, 'imported': {'from': target.name, 'file': name}, 'uncertainty': UNKNOWN_SD}
     return check_numbers(Calibration(
         model, values, np.diag(sd**2), tuple(status), frame_id, gauge, statistics=statistics, conditions=conditions, provenance=provenance,
         decision=dict.fromkeys(SENSORS, str(UNPROVEN)), decision_reasons=dict.fromkeys(SENSORS, reason),

@@ -16,7 +16,7 @@ from imu_calibration.document.exports.affine import AffineImu, Holding, Placemen
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.rotations import lever_matrix
 
-XYZ = 'XYZ'
+AXIS_LETTERS = 'XYZ'
 """Axes in the names of parameters."""
 
 
@@ -109,7 +109,7 @@ def read_parameters(content: bytes, what: str) -> dict[str, float]:
 
 def vector_of(found: dict[str, float], name: str, missing: float = 0.0) -> np.ndarray:
     """Return the parameters of the three axes, whose letter replaces ``*`` in the name, shape (3,)."""
-    return np.array([found.get(name.replace('*', axis), missing) for axis in XYZ])
+    return np.array([found.get(name.replace('*', axis), missing) for axis in AXIS_LETTERS])
 
 
 def refuse_curved(found: dict[str, float], beginnings: list[str]) -> None:
@@ -159,7 +159,7 @@ class Noise:
     """Whether the random walks are known: a noise document has them, a calibration has the white noise only."""
 
 
-STEPS = 30
+EXPORT_INVERSION_STEPS = 30
 """Fixed-point steps of the inversion: arms and g-sensitivity couple both sensors by small numbers."""
 
 
@@ -170,7 +170,7 @@ def inverted(imu: AffineImu, readings: Readings) -> tuple[np.ndarray, np.ndarray
     force, turning = ((raw - imu.bias[sensor] - np.outer(warmth, imu.thermal[sensor])) @ np.linalg.inv(imu.matrix[sensor]).T
                       for sensor, raw in zip(SENSORS, (readings.force, readings.rate)))
     apparent, cross = force, np.linalg.solve(imu.matrix['gyroscope'], imu.cross)
-    for _ in range(STEPS):
+    for _ in range(EXPORT_INVERSION_STEPS):
         rate = turning - force @ cross.T
         force = apparent - np.einsum('nij,ij->ni', lever_matrix(rate, readings.alpha), imu.arms)
     return force, rate

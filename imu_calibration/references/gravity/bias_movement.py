@@ -11,9 +11,9 @@ from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFindi
 from imu_calibration.references.gravity.equations import Poses
 from imu_calibration.references.gravity.hand_parameters import HandModel
 
-P_VALUE = 1e-3
+DRIFT_P_VALUE = 1e-3
 """A drift is significant below this p-value."""
-SPARE = 6
+MIN_DRIFT_FREEDOM = 6
 """Least number of poses beyond the columns."""
 
 
@@ -48,7 +48,7 @@ def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[s
 
 def _powers(time, count):
     """Return time and, with enough poses, its square, without their means, shape (k, 1 or 2)."""
-    powers = np.column_stack([time, time**2][:2 if count >= 2 * SPARE else 1])
+    powers = np.column_stack([time, time**2][:2 if count >= 2 * MIN_DRIFT_FREEDOM else 1])
     return powers - powers.mean(axis=0)
 
 
@@ -59,8 +59,8 @@ def _of_norms(time, residual, base):
     added = np.hstack([power[:, None] * back for power in powers.T])
     known, new = _orthonormal(base), _orthonormal(np.hstack([base, added]))
     spare = len(time) - new.shape[1]
-    if spare < SPARE or not _shown(*(np.sum((residual - basis @ (basis.T @ residual))**2) for basis in (known, new)),
-                                   new.shape[1] - known.shape[1], spare):
+    if spare < MIN_DRIFT_FREEDOM or not _shown(*(np.sum((residual - basis @ (basis.T @ residual))**2) for basis in (known, new)),
+                                               new.shape[1] - known.shape[1], spare):
         return None
     both = np.hstack([base, added])
     fitted = np.linalg.lstsq(both, residual, rcond=1e-9)[0][base.shape[1]:].reshape(-1, 3)
@@ -71,7 +71,7 @@ def _of_norms(time, residual, base):
 def _of_rates(time, rates):
     powers = _powers(time, len(time))
     spare = 3 * (len(time) - 1 - powers.shape[1])
-    if spare < 3 * SPARE:
+    if spare < 3 * MIN_DRIFT_FREEDOM:
         return None
     rates = rates - rates.mean(axis=0)
     course = powers @ np.linalg.lstsq(powers, rates, rcond=None)[0]
@@ -88,7 +88,7 @@ def _orthonormal(columns):
 
 def _shown(before, after, added, spare):
     ratio = (before - after) / max(added, 1) / max(after / spare, 1e-300)
-    return added > 0 and fdtrc(added, spare, max(ratio, 0.0)) < P_VALUE
+    return added > 0 and fdtrc(added, spare, max(ratio, 0.0)) < DRIFT_P_VALUE
 
 
 def without_movement(poses: Poses, movements: Mapping[str, BiasMovement]) -> Poses:

@@ -18,7 +18,7 @@ SCATTER_SD = (0.002, 1e-4, 2e-3)
 """Their standard deviations when there are too few poses or turns to estimate them, m/s^2, rad/s, rad."""
 
 
-NEAR = 1e-3
+MAX_FIRST_ORDER_ANGLE = 1e-3
 """rad; its square, times a turn's few radians, is the error of the first-order correction."""
 CALM = 0.05
 """Least scatter of the drifts in units of the noise of the means, so that no row has infinite weight."""
@@ -184,7 +184,7 @@ def _integrated(model, state, data, bias, key, memory):
         (old_bias, old_matrix, old_further), turn = memory[key]
         psi = (turn.by_bias @ (bias - old_bias) + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel()
                + turn.by_further @ (further - old_further))
-        if np.linalg.norm(psi) < NEAR:
+        if np.linalg.norm(psi) < MAX_FIRST_ORDER_ANGLE:
             return small_rotation(-psi) @ turn.mat_ji, turn
     turn = integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=_further_of_turn(model, state, data, bias))
     memory[key] = ((bias, matrix, further), turn)

@@ -7,16 +7,16 @@ from scipy.special import fdtrc
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.references.gravity.equations import Poses
 
-SPARE = 8
+MIN_PROCESS_FREEDOM = 8
 """With fewer poses beyond the columns the choice of the bias process explains too much."""
 CHOSEN = 2
 """Share and correlation time are estimated from the data as well."""
 SHARES = (0.0, 0.5, 0.8, 0.95, 0.99)
 """Candidate shares of the bias process in the scatter between poses."""
-TIMES = (0.1, 0.3, 1.0, 3.0)
+RELATIVE_TIMES = (0.1, 0.3, 1.0, 3.0)
 """Candidate correlation times of the bias process, in units of the time from the first pose to the last."""
-SILENT = {'g_sensitivity_p_value': 1.0, 'g_sensitivity_heldout_ratio': 1.0}
-P_VALUE = 1e-3
+NO_EVIDENCE = {'g_sensitivity_p_value': 1.0, 'g_sensitivity_heldout_ratio': 1.0}
+G_SENSITIVITY_P_VALUE = 1e-3
 """The g-sensitivity enters the model below this p-value."""
 EARTH_UPWARDS_SD = EARTH_RATE / np.sqrt(3)
 """
@@ -46,8 +46,8 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
     if poses.temperature_c is not None and np.ptp(poses.temperature_c) > 0:
         course = np.column_stack([course, (poses.temperature_c - poses.temperature_c.mean()) / np.ptp(poses.temperature_c)])
     full = np.column_stack([course, poses.force / np.linalg.norm(poses.force, axis=1).mean()])
-    if count < full.shape[1] + SPARE:
-        return dict(SILENT)
+    if count < full.shape[1] + MIN_PROCESS_FREEDOM:
+        return dict(NO_EVIDENCE)
     up, first = full[:, course.shape[1]:], course.shape[1]
     upwards = np.trace(np.linalg.lstsq(full, poses.rate, rcond=None)[0][first:]) / 3
     rate = poses.rate - np.clip(upwards, -EARTH_RATE, EARTH_RATE) * up
@@ -62,14 +62,14 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
 
 def shown(evidence: dict) -> bool:
     """Return whether the g-sensitivity is significant enough to enter the model without a request."""
-    return evidence['g_sensitivity_p_value'] < P_VALUE and evidence['g_sensitivity_heldout_ratio'] < 1
+    return evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P_VALUE and evidence['g_sensitivity_heldout_ratio'] < 1
 
 
 def _covariances(time):
     apart = np.abs(time[:, None] - time)
     yield np.eye(len(time))
     for share in SHARES[1:]:
-        for tau in TIMES:
+        for tau in RELATIVE_TIMES:
             yield (1 - share) * np.eye(len(time)) + share * np.exp(-apart / tau)
 
 

@@ -26,13 +26,13 @@ from imu_calibration.selection.questions import at_time_constants
 
 GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
 """x along the accelerometer's x input axis, y in the plane of its x and y input axes."""
-POSES_LEAST = 4
+MIN_ATTITUDES = 4
 """With fewer attitudes even the accelerometer's biases are determined by the prior."""
-SIGNIFICANT = 1.96**2
+CROSS_TERM_RATIO = 1.96**2
 """Likelihood ratio above which the data contradict a cross term of zero: 95 % of chi-square with one degree of freedom."""
-PASSES = 4
+MAX_HAND_PASSES = 4
 """Largest number of solutions, when the columns of a warm-up are recomputed or poses and turns are excluded."""
-SETTLED = 0.03
+MAX_SETTLED_CHANGE = 0.03
 """Relative change of a time constant below which its columns are not recomputed."""
 POSES_FULL = 12
 """The nine accelerometer parameters need one equation per attitude; further ones determine the scatter of the poses."""
@@ -76,7 +76,7 @@ class HandCalibration(Solution):
 
         Near the six faces the poses determine cross terms only through small tilts.
         """
-        return np.where(np.isin(self.param_names, CROSS_TERMS), SIGNIFICANT, 1.0)
+        return np.where(np.isin(self.param_names, CROSS_TERMS), CROSS_TERM_RATIO, 1.0)
 
     @property
     def statuses(self) -> tuple[Status, ...]:
@@ -160,9 +160,9 @@ def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, *,
     time = sample_times(imu)
     poses = average_poses(imu, _as_ranges(imu, stills), temperature_c)
     attitudes = distinct_attitudes(poses.force)
-    if attitudes < POSES_LEAST:
+    if attitudes < MIN_ATTITUDES:
         raise NotObservableError(
-            f'calibration by hand needs at least {POSES_LEAST} different attitudes held still ({POSES_FULL} or more for all parameters), '
+            f'calibration by hand needs at least {MIN_ATTITUDES} different attitudes held still ({POSES_FULL} or more for all parameters), '
             f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes, '
             'or describe the table or arm that moved it', key='table', code='too_few_attitudes')
     turns, dropped = collect_turns(time, imu, poses=poses, temperature_c=temperature_c)
@@ -194,7 +194,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
             trials = [replace(model, model=each) for each in at_time_constants(model.model, effect, float(poses.time[-1]))]
             scatter = [solved(trial, poses, turns)[0].scatter.variance[SENSORS.index(effect.sensor)] for trial in trials]
             model = trials[int(np.argmin(scatter))]
-    for _ in range(PASSES):
+    for _ in range(MAX_HAND_PASSES):
         found, error = solved(model, poses, turns)
         settled, model = _settled(model, found), model.at(found.state.values)
         poses, turns, out = without_outliers(model, found, poses=poses, turns=turns)
@@ -228,7 +228,7 @@ def _settled(model, found):
         part = model.model.slices[effect.key]
         if effect.time_constant and not found.held[part][-1]:
             known = model.model.point_of(effect)[-1]
-            if abs(found.state.values[part][-1] / known - 1) > SETTLED:
+            if abs(found.state.values[part][-1] / known - 1) > MAX_SETTLED_CHANGE:
                 return False
     return True
 
@@ -266,7 +266,7 @@ def _as_ranges(imu, stills):
     ranges = [(s.start, s.stop) if isinstance(s, slice) else (int(s[0]), int(s[1])) for s in stills]
     ranges = [(a, b) for a, b in ranges if b - a >= 2]
     if not ranges:
-        raise NotObservableError(f'calibration by hand needs at least {POSES_LEAST} different attitudes held still, '
+        raise NotObservableError(f'calibration by hand needs at least {MIN_ATTITUDES} different attitudes held still, '
                                  'got no interval at rest; hold the IMU still for a second or more in each attitude, '
                                  'or describe the table or arm that moved it', key='table', code='no_rest')
     return ranges

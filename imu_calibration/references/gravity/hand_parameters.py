@@ -11,11 +11,11 @@ from imu_calibration.effects.forward_equations import effect_slopes
 from imu_calibration.effects.sensor_model import SensorModel, linear_names
 from imu_calibration.kinematics.rotations import Reference
 
-UPPER = tuple(linear_names('accelerometer')[np.triu_indices(3, 1)].tolist())
+UPPER_TERMS = tuple(linear_names('accelerometer')[np.triu_indices(3, 1)].tolist())
 """Zero by the choice of axes."""
 CROSS_TERMS = tuple(linear_names('accelerometer')[np.tril_indices(3, -1)].tolist())
 """Estimated off-diagonal entries of the accelerometer matrix."""
-EXACT = 1e-12
+CONVENTION_SD = 1e-12
 """Sd of a parameter that a convention fixes."""
 UNKNOWN_BY_HAND = {'angular acceleration', 'attitude', 'joint angle', 'joint rate'}
 """Quantities that cannot be determined from gravity in poses and the rates between them."""
@@ -31,7 +31,7 @@ def possible_by_hand(effect: Effect) -> bool:
 @dataclass(frozen=True, eq=False)
 class HandModel:
     """
-    A SensorModel without table, in its order of parameters; `UPPER` is fixed.
+    A SensorModel without table, in its order of parameters; `UPPER_TERMS` is fixed.
 
     Raises
     ------
@@ -68,7 +68,7 @@ class HandModel:
     @cached_property
     def fixed(self) -> np.ndarray:
         """Mask of the parameters that the choice of axes fixes, shape (n,)."""
-        return np.isin(self.model.param_names, UPPER)
+        return np.isin(self.model.param_names, UPPER_TERMS)
 
     @cached_property
     def nominal(self) -> np.ndarray:
@@ -80,7 +80,7 @@ class HandModel:
     @cached_property
     def priors(self) -> np.ndarray:
         """Standard deviations about `nominal` before any data, shape (n,)."""
-        sd = np.where(self.fixed, EXACT, self.model.prior()[1])
+        sd = np.where(self.fixed, CONVENTION_SD, self.model.prior()[1])
         sd[self.gyro_matrix] *= self.gyro_factor
         return sd
 

@@ -24,9 +24,9 @@ from imu_calibration.selection.search import Named, Search
 
 OUTER = 12
 """Number of repetitions of the search without some of the poses, to measure the gain on them."""
-SPARE = 3
+MIN_SPARE_POSES = 3
 """Least number of poses beyond the nine parameters of the accelerometer."""
-POSES_LEAST = 9 + SPARE
+MIN_FOLD_POSES = 9 + MIN_SPARE_POSES
 """With fewer poses none can be held out."""
 
 
@@ -169,7 +169,7 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
 
     """
     poses = data.poses
-    if len(poses.start) < POSES_LEAST:
+    if len(poses.start) < MIN_FOLD_POSES:
         raise too_few_poses(len(poses.start))
     baseline = solve_by_hand(data, replace(options, accelerometer=options.accelerometer or BASE, gyroscope=options.gyroscope or BASE))
     follows_gravity = shown(g_sensitivity_evidence(poses))
@@ -190,7 +190,7 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
 
 def too_few_poses(count: int) -> NotObservableError:
     """Return the error of a recording with so few poses that none can be held out."""
-    return NotObservableError(f'a diagnosis by hand needs at least {POSES_LEAST} poses held still, so that some can be held out, '
+    return NotObservableError(f'a diagnosis by hand needs at least {MIN_FOLD_POSES} poses held still, so that some can be held out, '
                               f'{count} were found; hold the IMU still in more attitudes',
                               code='too_few_poses')
 

@@ -12,18 +12,18 @@ from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.references.gravity.effect_rows import Block, HandSpace
 from imu_calibration.selection.evidence import Evidence
 
-FOLDS = 12
+POSE_FOLDS = 12
 """Number of folds of the poses; with up to `ONE_BY_ONE` poses each pose is a fold."""
 ONE_BY_ONE = 24
-OFFSETS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+SCATTER_RATIOS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 """Candidate scatter of poses or turns beyond the noise of their samples, in units of that noise."""
 BIASES = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Candidate bias processes, in units of offset and noise together."""
-TIMES = (100.0, 300.0)
+BIAS_TIMES = (100.0, 300.0)
 """Its correlation times, s."""
-ALIKE = 0.1
+MIN_COLUMN_DIFFERENCE = 0.1
 """Columns that differ by less than this count as collinear."""
-UNIQUE = 0.2
+MIN_COLUMN_SINE = 0.2
 """Least sine of the angle between a column and the baseline's columns for the column to count."""
 
 
@@ -48,7 +48,7 @@ class HandEvidence(Evidence):
         self.blocks, self.space = blocks, space
         self._noise = [_noise(block, [*baseline, *(k for k in smooth if np.any(block.rows[:, :, k]))]) for block in blocks]
         poses = np.unique(np.concatenate([block.pose for block in blocks]))
-        n_folds = len(poses) if len(poses) <= ONE_BY_ONE else FOLDS
+        n_folds = len(poses) if len(poses) <= ONE_BY_ONE else POSE_FOLDS
         self.folds = [np.searchsorted(poses, block.pose) % n_folds for block in blocks]
         self._white = self._whitened()
         total, *without = (sum(rows.T @ rows for rows in white) for white in (self._white, *map(self._whitened, range(n_folds))))
@@ -110,11 +110,11 @@ class HandEvidence(Evidence):
     def rank(self, added: Sequence[int], smaller: Sequence[int]) -> int:
         """Return how many combinations of the added columns are not collinear with the smaller choice."""
         white = np.concatenate(self._white)
-        known, new = _basis(white[:, list(smaller)]), _basis(white[:, list(added)], ALIKE)
+        known, new = _basis(white[:, list(smaller)]), _basis(white[:, list(added)], MIN_COLUMN_DIFFERENCE)
         if not new.shape[1]:
             return 0
         sines = np.linalg.svd(new - known @ (known.T @ new), compute_uv=False)
-        return int(np.sum(sines > UNIQUE))
+        return int(np.sum(sines > MIN_COLUMN_SINE))
 
 
 def _basis(columns, least=1e-9):
@@ -133,8 +133,8 @@ def _noise(block, used):
     basis = _basis(block.rows.reshape(-1, width)[:, used])
     rows = np.concatenate([basis.reshape(count, axes, -1), block.rows[:, :, -1:]], axis=2)
     likelihood = NoiseLikelihood(rows, block.known, block.time, sessions=[np.arange(count)])
-    biases = [(share, time) for share in BIASES[1:] for time in TIMES] if block.name == 'poses' else []
-    shapes = [(offset, share * max(offset, 1.0), time) for offset in OFFSETS for share, time in [(0.0, TIMES[0]), *biases]]
+    biases = [(share, time) for share in BIASES[1:] for time in BIAS_TIMES] if block.name == 'poses' else []
+    shapes = [(offset, share * max(offset, 1.0), time) for offset in SCATTER_RATIOS for share, time in [(0.0, BIAS_TIMES[0]), *biases]]
     offset, bias, time = min(shapes, key=likelihood.loss)
     unit = likelihood.typical
     return block.known + (offset * unit)**2, (BiasProcess(bias * unit, time),) if bias else ()

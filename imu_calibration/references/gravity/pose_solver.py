@@ -7,9 +7,10 @@ import numpy as np
 
 from imu_calibration.core.distributions import chance_of_fall
 from imu_calibration.effects.base import Role
-from imu_calibration.estimation.covariance_terms import EARTH_RATE, GRAVITY, total
-from imu_calibration.estimation.model_error import LEAST_BLOCKS, ModelError, model_error_of_rows
-from imu_calibration.estimation.row_estimate import ITERATIONS, RowEstimate, estimate_rows
+from imu_calibration.estimation.covariance_terms import GRAVITY, UNMODELLED_EARTH_RATE, total
+from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, ModelError, model_error_of_rows
+from imu_calibration.estimation.row_estimate import MAX_NEWTON_STEPS, RowEstimate, estimate_rows
+from imu_calibration.estimation.solver import OUTLIER_P_VALUE
 from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -36,7 +37,7 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
     found = estimate_rows(GravityRows(model, poses, turns), first_state(model, poses), fallback=fallback)
     error, values = _model_error(GravityRows(model, poses, turns), found), found.state.values
     terms = {**found.terms, **error.terms(total(found.terms)), GRAVITY: _of_gravity(model, values, gravity_sd / model.gravity),
-             EARTH_RATE: _of_earth(model, found.state, poses, found.free)}
+             UNMODELLED_EARTH_RATE: _of_earth(model, found.state, poses, found.free)}
     return replace(found, terms=terms), error
 
 
@@ -48,7 +49,7 @@ def _model_error(reference, found):
     """
     model, free, count, rows = reference.model, found.free, len(reference.poses.start), reference.linearise(found.state)
     spare = np.isin(rows.component, (0, 2)).sum() - 2 * count - free.sum() + free[model.gyro_bias].sum()
-    if min(count, spare) < LEAST_BLOCKS or not free.any():
+    if min(count, spare) < MIN_SCATTER_BLOCKS or not free.any():
         return ModelError(np.ones(model.size), *np.zeros((2, model.size)))
     return model_error_of_rows(rows, found, model.model, block=np.minimum(rows.group[:, 0], count - 1))
 
@@ -57,7 +58,7 @@ def first_state(model: HandModel, poses: Poses) -> State:
     """Return a `State` from the norms in poses, which determine directions too, and the rates at rest."""
     values, nominal, priors, gravity = model.nominal.copy(), model.nominal, model.priors, model.gravity
     own = model.base_index('accelerometer')
-    for _ in range(ITERATIONS):
+    for _ in range(MAX_NEWTON_STEPS):
         residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
         rows = np.vstack([columns[:, own] / (1e-3 * gravity), np.diag(1 / priors[own])])
         target = np.concatenate([residual / (1e-3 * gravity), (nominal - values)[own] / priors[own]])
@@ -88,11 +89,9 @@ def _of_earth(model, state, poses, free):
     return np.outer(taken, taken)
 
 
-P_VALUE = 1e-3
-"""False positive rate for a recording without outliers, per kind."""
-SHARE = 0.1
+MAX_POSE_OUTLIERS = 0.1
 """Largest share of each kind that is excluded (one of few); a more frequent deviation is a property of the recording."""
-LEAST_SPARE = 3.0
+MIN_POSE_FREEDOM = 3.0
 """Degrees of freedom of the remaining data that the test requires."""
 CONTRADICTED = 0.35
 """
@@ -125,9 +124,9 @@ def without_outliers(model: HandModel, found: RowEstimate, *, poses: Poses, turn
         index = of_turn if COMPONENTS[kind] == 'turn' else range(len(poses.start))
         own = [(index[number], of_kind & (first == number)) for number in np.unique(first[of_kind])]
         total, spare = _distance(rest[of_kind], leverage[of_kind], 1e-3)
-        allowed = max(1, int(SHARE * len(own)))
+        allowed = max(1, int(MAX_POSE_OUTLIERS * len(own)))
         worst = sorted((_p_value(rest[at], leverage[at], total, spare), number) for number, at in own)
-        out = [number for p, number in worst[:allowed] if p * max(len(own), 1) < P_VALUE]
+        out = [number for p, number in worst[:allowed] if p * max(len(own), 1) < OUTLIER_P_VALUE]
         if out:
             left[COMPONENTS[kind]] = out
     if left.get('pose'):
@@ -156,7 +155,7 @@ def _distance(rest, basis, least):
 
 def _p_value(rest, basis, total, spare):
     square, count = _distance(rest, basis, LEAST_ERROR_SHARE)
-    if not count or spare - count < LEAST_SPARE:
+    if not count or spare - count < MIN_POSE_FREEDOM:
         return 1.0
     return chance_of_fall(square, count, rest=total - square, spare=spare - count)
 

@@ -9,8 +9,8 @@ from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.samples import ImuSamples
 
-FORMAT = 'imu_calibration/hand_samples/1'
-PAUSE_NS = 3600 * 10**9
+SAMPLES_FORMAT = 'imu_calibration/hand_samples/1'
+RESET_PAUSE_NS = 3600 * 10**9
 """Pause that is inserted at a clock reset: no turn is used across it."""
 REST_KEPT = 30.0
 """Of a rest that is discarded, this much is kept at its start and at its end, s."""
@@ -50,7 +50,7 @@ class HandStore:
             if not len(samples):
                 continue
             if epoch != self._epoch and self._parts:
-                self._shift = int(self._parts[-1].stamp_ns[-1]) + PAUSE_NS - int(samples.stamp_ns[0])
+                self._shift = int(self._parts[-1].stamp_ns[-1]) + RESET_PAUSE_NS - int(samples.stamp_ns[0])
             self._epoch = epoch
             self._parts.append(ImuSamples(samples.stamp_ns + self._shift, samples.force_s, samples.rate_s, samples.frame_id))
 
@@ -104,7 +104,7 @@ class HandStore:
         target, imu = io.BytesIO(), self.samples()
         if imu is None:
             imu = ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
-        np.savez(target, format=np.array(FORMAT), frame_id=np.array(imu.frame_id), stamp_ns=imu.stamp_ns, force_s=imu.force_s,
+        np.savez(target, format=np.array(SAMPLES_FORMAT), frame_id=np.array(imu.frame_id), stamp_ns=imu.stamp_ns, force_s=imu.force_s,
                  rate_s=imu.rate_s)
         return target.getvalue()
 
@@ -120,9 +120,9 @@ class HandStore:
         """
         try:
             with load_arrays(data) as arrays:
-                if str(arrays['format']) != FORMAT:
-                    raise DocumentError(f"samples must have the format '{FORMAT}', got '{arrays['format']}'; remove the file, or start "
-                                        'without resume')
+                if str(arrays['format']) != SAMPLES_FORMAT:
+                    raise DocumentError(f"samples must have the format '{SAMPLES_FORMAT}', got '{arrays['format']}'; remove the file, or "
+                                        'start without resume')
                 imu = ImuSamples(arrays['stamp_ns'], arrays['force_s'], arrays['rate_s'], str(arrays['frame_id']))
             for values, kind, shape in ((imu.stamp_ns, 'i', ()), (imu.force_s, 'f', (3,)), (imu.rate_s, 'f', (3,))):
                 if values.dtype.kind != kind or values.shape != (imu.stamp_ns.size, *shape):
@@ -130,7 +130,7 @@ class HandStore:
         except ImuCalibrationError:
             raise
         except Exception as error:   # damaged archives and arrays raise many kinds
-            raise DocumentError(f'saved samples must be a whole file of {FORMAT}, this is not '
+            raise DocumentError(f'saved samples must be a whole file of {SAMPLES_FORMAT}, this is not '
                                 f'({shortened(f"{type(error).__name__}: {error}", 200)}); remove it, or start without resume',
                                 code='samples_damaged') from error
         if len(imu):

@@ -7,11 +7,11 @@ import numpy as np
 from imu_calibration.core.samples import ImuSamples, runs_of
 from imu_calibration.kinematics.strapdown import total_rotation
 from imu_calibration.preprocessing.full_scale import LEAST_TURNS, MOST_TURNS, believed_factor
-from imu_calibration.preprocessing.stamping import LAG, LATE, MOST_LOST, WHOLE
+from imu_calibration.preprocessing.stamping import LAG, MAX_REGULAR_STEP, MOST_LOST, WHOLE_STEP_SHARE
 from imu_calibration.references.gravity.equations import Poses, State, TurnData
 from imu_calibration.references.gravity.hand_options import KnownTurn
 
-LARGEST = 4000
+MAX_RANGE_READINGS = 4000
 """Largest readings among which the end of the range is searched."""
 TOP = 20
 """Readings below the largest whose density is estimated."""
@@ -25,7 +25,7 @@ UNDECIDED = 1.02
 """Factor by which interpolation errors at even times may exceed those at the stamps, due to noise."""
 TURN_LONGEST = 30.0
 """Longer stretches between two poses are not used, s: drift and clipping enter."""
-GAP = 0.1
+MAX_TURN_GAP = 0.1
 """A turn with a longer hole in it is not used, s; never below five periods."""
 KNOWN_TURN_SD = 0.017
 """Accuracy of the angle and of the axis of full turns made by hand, rad."""
@@ -37,7 +37,7 @@ def collect_turns(time: np.ndarray, imu: ImuSamples, *, poses: Poses,
                   temperature_c: np.ndarray | None = None) -> tuple[list[TurnData], dict[str, int]]:
     """Return (turns between consecutive poses, {reason: count of excluded ones}); `temperature_c` is that of the samples or None."""
     turns, dropped, rate = [], {}, imu.rate_s
-    limit = max(GAP, 5 * poses.period)
+    limit = max(MAX_TURN_GAP, 5 * poses.period)
     ended = at_range_end(rate)
     density = np.mean(poses.noise['gyroscope'].low_variance) * poses.period
     for first in range(len(poses.start) - 1):
@@ -82,7 +82,7 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
 def _at_end(values, fresh):
     """Return the rows with a value at the largest of all `values` (n, m), when that is the end of a range."""
     some = values[fresh].ravel()
-    some = np.sort(np.partition(some, -LARGEST)[-LARGEST:] if len(some) > LARGEST else some)
+    some = np.sort(np.partition(some, -MAX_RANGE_READINGS)[-MAX_RANGE_READINGS:] if len(some) > MAX_RANGE_READINGS else some)
     step = np.diff(some)
     step = step[step > 1e-9 * np.abs(some[-1])].min(initial=np.inf)
     margin = 1.5 * step if np.isfinite(step) and values.shape[1] > 1 else 0.5 * step   # two's complement: one end is larger by a step
@@ -121,8 +121,8 @@ def sample_times(imu: ImuSamples) -> np.ndarray:
     stamps = rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
     even, period = stamps.copy(), float(np.median(np.diff(stamps)))
     step = np.diff(stamps) / period
-    count = np.where((step > LATE) & (np.abs(step - np.rint(step)) <= WHOLE), np.rint(step), 1.0)
-    number, edges = np.concatenate([[0.0], np.cumsum(count)]), np.flatnonzero(step > MOST_LOST + LATE) + 1
+    count = np.where((step > MAX_REGULAR_STEP) & (np.abs(step - np.rint(step)) <= WHOLE_STEP_SHARE), np.rint(step), 1.0)
+    number, edges = np.concatenate([[0.0], np.cumsum(count)]), np.flatnonzero(step > MOST_LOST + MAX_REGULAR_STEP) + 1
     for part in np.split(np.arange(len(stamps)), edges):
         if len(part) >= 2 * LAG:
             lines = (_clock_line(each, stamps[part], max(1, int(period * len(part) / LINE))) for each in (number[part], part))

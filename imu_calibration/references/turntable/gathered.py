@@ -13,7 +13,7 @@ from imu_calibration.estimation.accumulator import Accumulator, restrict, select
 from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters, make_prior
-from imu_calibration.estimation.window_statistics import AXES, WindowStatistics, count_pieces, pieces_at_rest, reduce_window
+from imu_calibration.estimation.window_statistics import N_AXES, WindowStatistics, count_pieces, pieces_at_rest, reduce_window
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
@@ -87,10 +87,10 @@ def owned_window(window: Window) -> Window:
                   joint_step=window.joint_step)
 
 
-FOLDS = 8
+TABLE_FOLDS = 8
 """Folds of the cross-validation."""
-BLOCKS = 3 * FOLDS
-"""Blocks that are resampled for an interval; block k belongs to fold k modulo FOLDS."""
+BLOCKS = 3 * TABLE_FOLDS
+"""Blocks that are resampled for an interval; block k belongs to fold k modulo TABLE_FOLDS."""
 
 
 @dataclass(eq=False)
@@ -134,7 +134,7 @@ class HeldOutBlock:
 
     def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOutBlock':
         """Return the block with the columns of the model `narrow` only."""
-        chosen = {sensor: np.concatenate([columns[:-AXES], np.arange(-2 * AXES, 0)])
+        chosen = {sensor: np.concatenate([columns[:-N_AXES], np.arange(-2 * N_AXES, 0)])
                   for sensor, columns in selected_columns(wide, narrow).items()}
         return HeldOutBlock(restrict(self.accumulator, wide, narrow), {key: rows[:, chosen[key[0]]] for key, rows in self.pieces.items()},
                             self.counts, self.judged)
@@ -187,10 +187,10 @@ class HeldOut:
         """
         model, prior, values = solution.model, make_prior(solution.model), solution.values
         free = ~fixed_parameters(model) & ~solution.held
-        parts = [_linearised(self.blocks[fold::FOLDS], solution, prior) for fold in range(FOLDS)]
+        parts = [_linearised(self.blocks[fold::TABLE_FOLDS], solution, prior) for fold in range(TABLE_FOLDS)]
         known = np.column_stack([prior.root, prior.root @ (values - prior.mean)])
         found = []
-        for fold in range(FOLDS):
+        for fold in range(TABLE_FOLDS):
             rows = np.concatenate([known, *(part for k, part in enumerate(parts) if k != fold)])
             moved = values.copy()
             moved[free] -= scaled_lstsq(rows[:, :-1][:, free], rows[:, -1])
@@ -210,7 +210,7 @@ def _linearised(blocks, solution, prior):
     return triangular(np.concatenate(rows)) if rows else np.zeros((0, n_params + 1))
 
 
-MOST_SAMPLES = 100_000
+MAX_KEPT_SAMPLES = 100_000
 """Most samples kept; beyond it every second window of each kind is removed."""
 
 
@@ -231,7 +231,7 @@ class SpreadWindows:
             return
         self._kept.append((number, window))
         self.n_samples += len(window.time)
-        while self.n_samples > MOST_SAMPLES and len(self._kept) > 1:
+        while self.n_samples > MAX_KEPT_SAMPLES and len(self._kept) > 1:
             self._stride *= 2
             self._kept = [(number, window) for number, window in self._kept if number % self._stride == 0]
             self.n_samples = sum(len(window.time) for _, window in self._kept)

@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.exports.affine import OFFSETS, SCALES, THERMAL_OFFSETS, AffineImu, forward_right_down, of
 from imu_calibration.document.exports.target import (
-    XYZ,
+    AXIS_LETTERS,
     Page,
     Read,
     Target,
@@ -22,34 +22,34 @@ from imu_calibration.effects.base import SENSORS
 OFFSET = {'accelerometer': 'INS_ACCOFFS', 'gyroscope': 'INS_GYROFFS'}
 SCALE = 'INS_ACCSCAL'
 CALTEMP = {'accelerometer': 'INS_ACC1_CALTEMP', 'gyroscope': 'INS_GYR1_CALTEMP'}
-TCAL, ORDER = 'INS_TCAL1', {'accelerometer': 'ACC', 'gyroscope': 'GYR'}
-REFERENCE_C, PER_PARAMETER = 35.0, 1e-6
-"""Temperature of the polynomials, fixed; unit of their coefficients."""
-DEFAULT_RANGE = (0.0, 70.0)
+TCAL, TCAL_SENSORS = 'INS_TCAL1', {'accelerometer': 'ACC', 'gyroscope': 'GYR'}
+PER_PARAMETER = 1e-6
+"""Unit of the coefficients of the polynomials."""
+ARDUPILOT_RANGE_C = (0.0, 70.0)
 NO_TEMPERATURE = -300.0
 LARGEST_OFFSET, SCALES_ALLOWED = 3.5, (0.8, 1.2)
 
 
 def numbers(imu: AffineImu) -> dict:
     """Return parameters; offsets count at the temperature CALTEMP, polynomials without constant are about 35 C."""
-    found = {f'{OFFSET[s]}_{a}': value for s in SENSORS for a, value in zip(XYZ, imu.bias[s])}
-    found |= {f'{SCALE}_{a}': 1.0 / value for a, value in zip(XYZ, np.diag(imu.matrix['accelerometer']))}
+    found = {f'{OFFSET[s]}_{a}': value for s in SENSORS for a, value in zip(AXIS_LETTERS, imu.bias[s])}
+    found |= {f'{SCALE}_{a}': 1.0 / value for a, value in zip(AXIS_LETTERS, np.diag(imu.matrix['accelerometer']))}
     if any(np.any(imu.thermal[sensor]) for sensor in SENSORS):
-        low, high = imu.temperature_range_c or DEFAULT_RANGE
+        low, high = imu.temperature_range_c or ARDUPILOT_RANGE_C
         found |= {f'{TCAL}_ENABLE': 1, f'{TCAL}_TMIN': low, f'{TCAL}_TMAX': high}
         for sensor in SENSORS:
             found[CALTEMP[sensor]] = imu.temperature_ref_c
-            found |= {f'{TCAL}_{ORDER[sensor]}{power}_{a}': float(value) / PER_PARAMETER if power == 1 else 0.0
-                      for power in (1, 2, 3) for a, value in zip(XYZ, imu.thermal[sensor])}
+            found |= {f'{TCAL}_{TCAL_SENSORS[sensor]}{power}_{a}': float(value) / PER_PARAMETER if power == 1 else 0.0
+                      for power in (1, 2, 3) for a, value in zip(AXIS_LETTERS, imu.thermal[sensor])}
     return found
 
 
 def imu(found: dict) -> AffineImu:
     """Return the IMU of such parameters."""
     on = found.get(f'{TCAL}_ENABLE') == 1
-    limits = (found.get(f'{TCAL}_TMIN', DEFAULT_RANGE[0]), found.get(f'{TCAL}_TMAX', DEFAULT_RANGE[1])) if on else None
+    limits = (found.get(f'{TCAL}_TMIN', ARDUPILOT_RANGE_C[0]), found.get(f'{TCAL}_TMAX', ARDUPILOT_RANGE_C[1])) if on else None
     ref = float(np.clip(found.get(CALTEMP['accelerometer'], NO_TEMPERATURE), *limits)) if limits else 25.0
-    thermal = {s: vector_of(found, f'{TCAL}_{ORDER[s]}1_*') * PER_PARAMETER * on for s in SENSORS}
+    thermal = {s: vector_of(found, f'{TCAL}_{TCAL_SENSORS[s]}1_*') * PER_PARAMETER * on for s in SENSORS}
     bias = {s: vector_of(found, OFFSET[s] + '_*') for s in SENSORS}
     if limits:   # both sensors may have been calibrated at temperatures of their own; the document has one
         there = float(np.clip(found.get(CALTEMP['gyroscope'], NO_TEMPERATURE), *limits))
@@ -72,7 +72,7 @@ def read(content: bytes, _path: str | Path) -> Read:
         raise InputError('the ArduPilot parameter file must hold INS_ACCOFFS, INS_ACCSCAL or INS_GYROFFS, it holds none of them; '
                          'give another file')
     if found.get(f'{TCAL}_ENABLE') == 1:
-        refuse_curved(found, [f'{TCAL}_{short}{power}' for short in ORDER.values() for power in (2, 3)])
+        refuse_curved(found, [f'{TCAL}_{short}{power}' for short in TCAL_SENSORS.values() for power in (2, 3)])
     lacks = tuple(h for s in SENSORS for h in of(s, OFFSETS) if not any(name.startswith(OFFSET[s]) for name in found))
     lacks += () if any(name.startswith(SCALE) for name in found) else of('accelerometer', SCALES)
     return Read(found, lacks)

@@ -8,15 +8,15 @@ import numpy as np
 from imu_calibration.core.errors import InputError, shortened
 from imu_calibration.document.exports.affine import OFFSETS, SCALES, AffineImu, of
 from imu_calibration.document.exports.target import Noise, Page, Read, Target, numbers_at, read_yaml, section, yaml_file
+from imu_calibration.effects.base import AXES
 
-AXES = 'xyz'
-TOPIC = 'gyro_scale_input'
+SCALE_KEY = 'gyro_scale_input'
 
 
 def numbers(imu: AffineImu) -> dict:
     """Return offsets and scale factors of the gyroscopes: the same model as ours on the diagonal."""
     offsets = {f'angular_velocity_offset_{a}': value for a, value in zip(AXES, imu.bias['gyroscope'])}
-    return {**offsets, TOPIC: np.diag(imu.matrix['gyroscope'])}
+    return {**offsets, SCALE_KEY: np.diag(imu.matrix['gyroscope'])}
 
 
 def _offset(found):
@@ -26,7 +26,7 @@ def _offset(found):
 def imu(found: dict) -> AffineImu:
     """Return the IMU of such numbers."""
     return AffineImu(bias={'accelerometer': np.zeros(3), 'gyroscope': _offset(found)},
-                     matrix={'accelerometer': np.eye(3), 'gyroscope': np.diag(found[TOPIC])})
+                     matrix={'accelerometer': np.eye(3), 'gyroscope': np.diag(found[SCALE_KEY])})
 
 
 def noise(found: Noise) -> dict:
@@ -37,10 +37,10 @@ def noise(found: Noise) -> dict:
 
 def write(page: Page) -> str:
     """Return a parameter file."""
-    x, y, z = (float(value) for value in page.numbers[TOPIC])
-    scale = [f'the file has no scale factors; the node reads them from the topic {TOPIC}, published repeatedly:',
-             f'  ros2 topic pub -r 1 {TOPIC} geometry_msgs/msg/Vector3Stamped "{{vector: {{x: {x!r}, y: {y!r}, z: {z!r}}}}}"']
-    parameters = {name: value for name, value in page.numbers.items() if name != TOPIC} | (page.noise or {})
+    x, y, z = (float(value) for value in page.numbers[SCALE_KEY])
+    scale = [f'the file has no scale factors; the node reads them from the topic {SCALE_KEY}, published repeatedly:',
+             f'  ros2 topic pub -r 1 {SCALE_KEY} geometry_msgs/msg/Vector3Stamped "{{vector: {{x: {x!r}, y: {y!r}, z: {z!r}}}}}"']
+    parameters = {name: value for name, value in page.numbers.items() if name != SCALE_KEY} | (page.noise or {})
     switches = {'correct_for_static_bias': True, 'correct_for_dynamic_bias': False, 'correct_for_scale': True}
     return yaml_file([*page.comments, *scale], {'/**': {'ros__parameters': {**parameters, 'on_off_correction': switches}}})
 
@@ -50,12 +50,13 @@ def read(content: bytes, _path: str | Path) -> Read:
     what = 'imu_corrector parameter file'
     found = section(section(read_yaml(content, what), '/**', what), 'ros__parameters', what)
     offsets = {name: float(numbers_at(found, name, (), what=what)) for name in (f'angular_velocity_offset_{a}' for a in AXES)}
-    scale = re.search(rf'^#.*{TOPIC} .*\{{x: (\S+), y: (\S+), z: ([^}}\s]+)\}}', content.decode(), flags=re.M)
+    scale = re.search(rf'^#.*{SCALE_KEY} .*\{{x: (\S+), y: (\S+), z: ([^}}\s]+)\}}', content.decode(), flags=re.M)
     try:
         values = [float(part) for part in scale.groups()] if scale else [1.0] * 3
     except ValueError as error:
-        raise InputError(f'the {what} must repeat three numbers in its comment on {TOPIC}: {shortened(str(error))}; correct it') from error
-    return Read({**offsets, TOPIC: values}, () if scale else of('gyroscope', SCALES))
+        raise InputError(f'the {what} must repeat three numbers in its comment on {SCALE_KEY}: {shortened(str(error))}; '
+                         'correct it') from error
+    return Read({**offsets, SCALE_KEY: values}, () if scale else of('gyroscope', SCALES))
 
 
 TARGETS = (Target(

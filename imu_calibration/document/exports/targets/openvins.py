@@ -17,7 +17,7 @@ from imu_calibration.document.exports.target import Page, Read, Target, numbers_
 from imu_calibration.document.exports.targets.kalibr import noise, read_densities
 
 SHAPES = {'lower': lower_times_rotation, 'upper': upper_times_rotation}
-NAMES = ('Tw', 'R_IMUtoGYRO', 'Ta', 'R_IMUtoACC', 'Tg')
+MATRIX_KEYS = ('Tw', 'R_IMUtoGYRO', 'Ta', 'R_IMUtoACC', 'Tg')
 
 
 def numbers(imu: AffineImu, shape: str) -> dict:
@@ -28,7 +28,7 @@ def numbers(imu: AffineImu, shape: str) -> dict:
 
 def imu(found: dict) -> AffineImu:
     """Return the IMU of such numbers: ``a_m = Ta R_IMUtoACC f``, ``w_m = Tw R_IMUtoGYRO w + Tg f``."""
-    tw, to_gyro, ta, to_acc, tg = (np.asarray(found[name]) for name in NAMES)
+    tw, to_gyro, ta, to_acc, tg = (np.asarray(found[name]) for name in MATRIX_KEYS)
     return AffineImu(matrix={'accelerometer': ta @ to_acc, 'gyroscope': tw @ to_gyro}, cross=tg)
 
 
@@ -43,8 +43,8 @@ def read(content: bytes, _path: str | Path) -> Read:
     """Read a chain; missing entries are the identity, or zero, as in OpenVINS."""
     what = 'OpenVINS chain'
     chain = section(read_yaml(content, what), 'imu0', what)
-    found = {name: np.zeros((3, 3)) if name == 'Tg' else np.eye(3) for name in NAMES}
-    found |= {name: numbers_at(chain, name, (3, 3), what=what) for name in NAMES if name in chain}
+    found = {name: np.zeros((3, 3)) if name == 'Tg' else np.eye(3) for name in MATRIX_KEYS}
+    found |= {name: numbers_at(chain, name, (3, 3), what=what) for name in MATRIX_KEYS if name in chain}
     return Read(found, (), read_densities(chain))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.exports.affine import OFFSETS, SCALES, THERMAL_OFFSETS, AffineImu, forward_right_down, of
 from imu_calibration.document.exports.target import (
-    XYZ,
+    AXIS_LETTERS,
     Page,
     Read,
     Target,
@@ -21,7 +21,7 @@ from imu_calibration.effects.base import SENSORS
 
 CAL = {'accelerometer': 'CAL_ACC0', 'gyroscope': 'CAL_GYRO0'}
 TC = {'accelerometer': 'TC_A', 'gyroscope': 'TC_G'}
-DEFAULT_RANGE = (0.0, 100.0)
+PX4_RANGE_C = (0.0, 100.0)
 """Degrees Celsius; PX4's own range of thermal compensation."""
 UNNOTICED = 0.01
 """Norm up to which PX4 ignores a change of an offset (m/s^2, rad/s) or a scale; 0.001 in older versions."""
@@ -33,9 +33,9 @@ def numbers(imu: AffineImu) -> dict:
     """Return parameters; the coefficient of power p of axis a is called ``X{p}_{a}``."""
     found: dict[str, float] = {}
     for sensor in SENSORS:
-        found |= {f'{CAL[sensor]}_{a}OFF': value for a, value in zip(XYZ, imu.bias[sensor])}
-    found |= {f'{CAL["accelerometer"]}_{a}SCALE': 1.0 / value for a, value in zip(XYZ, np.diag(imu.matrix['accelerometer']))}
-    low, high = imu.temperature_range_c or DEFAULT_RANGE
+        found |= {f'{CAL[sensor]}_{a}OFF': value for a, value in zip(AXIS_LETTERS, imu.bias[sensor])}
+    found |= {f'{CAL["accelerometer"]}_{a}SCALE': 1.0 / value for a, value in zip(AXIS_LETTERS, np.diag(imu.matrix['accelerometer']))}
+    low, high = imu.temperature_range_c or PX4_RANGE_C
     for sensor in SENSORS:
         if np.any(imu.thermal[sensor]):
             short = TC[sensor]

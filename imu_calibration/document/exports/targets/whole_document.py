@@ -11,9 +11,9 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.document.exports.target import Page, Read, Target, plain, read_json
 from imu_calibration.effects.base import SENSORS
 
-HEADER = b'MATLAB 5.0 MAT-file'
+MAT_HEADER = b'MATLAB 5.0 MAT-file'
 """Beginning of a .mat file; the rest of its text, which holds the time, is made blank: the same input gives the same bytes."""
-TEXT = 116
+MAT_TEXT_BYTES = 116
 DOCUMENT = 'document_json'
 
 
@@ -37,7 +37,7 @@ def write_mat(page: Page) -> bytes:
     savemat(stream, {**sensors, 'param_names': np.array(calibration.param_names, dtype=object), 'values': calibration.values,
                      'sd': calibration.sd, 'covariance': calibration.covariance, 'status': np.array(calibration.status, dtype=object),
                      'comments': '\n'.join(page.comments), DOCUMENT: json.dumps(plain(page.numbers))}, long_field_names=True)
-    return HEADER.ljust(TEXT) + stream.getvalue()[TEXT:]
+    return MAT_HEADER.ljust(MAT_TEXT_BYTES) + stream.getvalue()[MAT_TEXT_BYTES:]
 
 
 def read_mat(content: bytes, _path: str | Path) -> Read:
