@@ -32,7 +32,7 @@ from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController, excess, trajectory_from
 
-STEP = 0.01
+STEP = 0.02
 NAMES = ('outer', 'inner')
 LIMITS = MotionLimits(np.array([-np.inf, -1.5]), np.array([np.inf, 1.5]), np.array([2.0, 1.0]), np.array([4.0, 2.0]), np.ones(2, bool))
 
