@@ -188,7 +188,7 @@ def test_joint_states_without_positions_and_zero_stamps_are_named(bench, session
     bench.until(silent.get_subscription_count, 'a subscription')
     for _ in range(20):
         silent.publish(JointState(name=['outer', 'middle', 'inner']))
-    bench.until(lambda: bench.heard('/joint_states', '20 JointState'), 'the empty position')
+    bench.until(lambda: bench.heard('/joint_states', '20 ', 'JointState'), 'the empty position')
     assert not bench.heard('outer, middle, inner', level='warning') and not bench.heard('outer, middle, inner', level='error')
     to = bench.node.create_publisher(Imu, 'imu/data_raw', 1000)
     bench.until(to.get_subscription_count, 'a subscription')

@@ -102,6 +102,11 @@ class Bench:
         return self.driver.state
 
 
+def named(reason):
+    """Return the joints that a reason names."""
+    return {name for name in NAMES if name in reason}
+
+
 @pytest.mark.parametrize('kind', ['rest', 'spin', 'swing'])
 @pytest.mark.parametrize('controller', [{}, {'lag': 0.4}, {'speed_scaling': 0.3}])
 def test_a_motion_is_followed_to_its_end_however_slow_and_late_the_controller_is(kind, controller):
@@ -216,11 +221,10 @@ def test_stop_is_safe_at_any_moment(moment):
     assert bench.driver.state is DriveState.STOPPED and not bench.driver.observe(bench.now, np.full(2, 9.0), np.full(2, 9.0), now=bench.now)
 
 
-@pytest.mark.parametrize('controller, sentence', [
-    ({'stall_joint': 'inner', 'stall_time': 2.0}, r'joint inner(, at .* deg, does not follow: the joints are .* deg from their path| has made no progress)'),
-    ({'stall_joint': 'inner', 'stall_time': 0.0}, r'joint inner'),
-    ({'refuse_after': 0}, r'nothing moved for 3\.\d s after a trajectory was sent: stopped; the controller refused it or does not listen')])
-def test_joints_that_stall_and_controllers_that_refuse_stop_everything_with_one_sentence(controller, sentence):
+@pytest.mark.parametrize('controller, joints, number', [
+    ({'stall_joint': 'inner', 'stall_time': 2.0}, {'inner'}, r'\d (deg|s)'), ({'stall_joint': 'inner', 'stall_time': 0.0}, {'inner'}, r'\d (deg|s)'),
+    ({'refuse_after': 0}, set(), r'3\.\d s')])
+def test_joints_that_stall_and_controllers_that_refuse_stop_everything_with_one_sentence(controller, joints, number):
     bench = Bench(**controller)
     bench.driver.start()
     points = motion_points(LIMITS, 4, kind='swing')
@@ -229,7 +233,7 @@ def test_joints_that_stall_and_controllers_that_refuse_stop_everything_with_one_
     except InputError:   # as on a topic, nobody is told that it was refused
         pass
     assert bench.until_it_rests() is DriveState.STOPPED and bench.stops == 1
-    assert re.match(sentence, bench.driver.reason), bench.driver.reason
+    assert named(bench.driver.reason) == joints and re.search(number, bench.driver.reason), bench.driver.reason
     assert '\n' not in bench.driver.reason and bench.now < 25.0
 
 
@@ -253,18 +257,18 @@ def test_a_controller_has_its_patience_by_the_clock_of_the_joints_and_by_ours(cl
         bench.look()
     bench.table.follow(bench.now, TrajectoryPoints.stop(NAMES))   # somebody else stops it, long after it was sent
     stopped = bench.now
-    assert bench.until_it_rests() is DriveState.STOPPED and 'has made no progress for' in bench.driver.reason
+    assert bench.until_it_rests() is DriveState.STOPPED and len(named(bench.driver.reason)) == 1
     assert 0.0 <= bench.now - stopped - patience < 1.0
 
 
 def test_a_joint_that_is_pushed_off_its_path_beyond_its_range_or_too_fast_stops_everything():
-    for place, rate, words in (([0.0, 0.2], [0.0, 0.0], 'does not follow'), ([0.0, 1.6], [0.0, 0.0], 'inner, at 91.7 deg, is beyond its range'),
-                               ([0.0, 0.0], [0.0, 2.0], 'inner turns at 2.00 times its largest speed')):
+    for place, rate, joint, number in (([0.0, 0.2], [0.0, 0.0], 'outer', '11.4 deg'), ([0.0, 1.6], [0.0, 0.0], 'inner', '91.7 deg'),
+                                       ([0.0, 0.0], [0.0, 2.0], 'inner', '2.00')):
         bench = Bench()
         bench.driver.start()
         bench.move(motion_points(LIMITS, 5))
         assert bench.driver.observe(bench.now + STEP, np.array(place), np.array(rate), now=bench.now)
-        assert bench.driver.state is DriveState.STOPPED and words in bench.driver.reason
+        assert bench.driver.state is DriveState.STOPPED and named(bench.driver.reason) == {joint} and number in bench.driver.reason
 
 
 def test_joint_states_that_fall_silent_stop_everything():
@@ -288,7 +292,7 @@ def test_joints_that_do_not_come_to_rest_stop_everything():
     for k in range(300):
         if bench.driver.observe(bench.now + k * STEP, place + 0.02 * np.sin(k * 0.5), np.zeros(2), now=bench.now):
             break
-    assert 'do not rest within 2 s' in bench.driver.reason
+    assert ' 2 s' in bench.driver.reason and not named(bench.driver.reason)
 
 
 def random_limits(seed):
@@ -379,13 +383,15 @@ def test_a_campaign_moves_asks_what_is_wrong_separates_and_ends_with_its_reason(
     hand = OldHand()
     campaign, alike, alone = Campaign(hand, make_separator=hand.separator), Suspect('gyro_quadratic', ('gyro_scale_asymmetry',), {'x': 1e-3}), Suspect('gyro_scale_asymmetry')
     decided = carried_out(campaign, [[alike], [alone]])
-    assert decided == ['move'] * 4 + ['diagnose', 'move', 'move', 'diagnose', 'all within tolerance; beyond bias and matrix there is gyro_scale_asymmetry']
+    assert decided[:-1] == ['move'] * 4 + ['diagnose', 'move', 'move', 'diagnose'] and decided[-1].startswith('all within tolerance')
+    assert 'gyro_scale_asymmetry' in decided[-1] and 'gyro_quadratic' not in decided[-1]
     assert hand.separated == [alike] and campaign.separations == 1
     stubborn = Campaign(hand := OldHand(), CampaignSettings(separations=2), hand.separator)
-    assert carried_out(stubborn, [[alike]] * 9)[-1].endswith('there is gyro_quadratic (collinear with gyro_scale_asymmetry)')
+    why = carried_out(stubborn, [[alike]] * 9)[-1]
+    assert 'gyro_quadratic' in why and 'gyro_scale_asymmetry' in why
     assert stubborn.separations == 2
     hand.separable = False
-    assert 'no motion is known that separates them: no joint turns' in Campaign(hand, make_separator=hand.separator).take_findings([alike])
+    assert 'no joint turns' in Campaign(hand, make_separator=hand.separator).take_findings([alike])
 
 
 def test_a_campaign_ends_when_the_time_is_over_or_motions_bring_nothing_any_more():

@@ -154,7 +154,7 @@ def test_a_single_shaft_gives_the_best_it_can_and_says_what_is_missing(capsys, t
     assert 'gyroscope.matrix.zz' not in document['missing']
     assert document['lower_bound_seconds'] is None   # 1.9e45 s for tolerances out of reach
     assert {'gyroscope.matrix.xx', 'accelerometer.matrix.zz'} <= set(document['missing'])
-    assert 'outside their tolerance' in capsys.readouterr().out
+    assert ', '.join(document['missing']) in capsys.readouterr().out
 
 
 def test_the_verb_writes_a_plan_that_a_controller_can_follow(capsys, tmp_path):
@@ -170,7 +170,7 @@ def test_the_verb_writes_a_plan_that_a_controller_can_follow(capsys, tmp_path):
     assert last['time_from_start']['sec'] + 1e-9 * last['time_from_start']['nanosec'] == pytest.approx(document['seconds'], abs=1e-3)
     assert JOINT_TRAJECTORY_TYPE in (out / 'trajectory/metadata.yaml').read_text()
     assert '<svg' in (out / 'report.html').read_text()
-    assert 'within their tolerance' in capsys.readouterr().out
+    assert {str(len(document['motions'])), f'{document["seconds"]:.0f}'} <= set(capsys.readouterr().out.split())
 
 
 def test_a_plan_without_anything_that_moves_is_refused_in_one_line(capsys, tmp_path):
@@ -231,7 +231,8 @@ def test_by_hand_the_steps_are_planned_in_words_and_pictures(capsys, tmp_path):
     assert len(kinds) >= 12 and kinds.count('turn') >= 3 and set(kinds) <= {'pose', 'turn'}
     assert document['seconds'] == pytest.approx(sum(motion['seconds'] for motion in document['motions']))
     assert document['missing'] == [] and '<svg' in (out / 'report.html').read_text()
-    assert 'hold it still' in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert all(motion['text'] in printed for motion in document['motions'])
 
 
 def test_a_plan_does_what_the_mixed_design_of_the_papers_does_in_no_more_time():
