@@ -1,6 +1,6 @@
 """An effect: one physical cause of sensor output, its columns, its coefficients and their derivatives."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any
@@ -55,6 +55,33 @@ Values = dict[str, np.ndarray]
 """Effect name -> values of the effects of a sensor; column group -> coefficients."""
 
 
+class Lag:
+    """
+    A weighted mean of delays, all proportional to the first value.
+
+    Parameters
+    ----------
+    pairs : sequence of (weight, delay)
+        Delays in units of the first value.
+    factor : callable, optional
+        ``factor(time, values) -> (n,)``, of a delay that changes with time.
+
+    """
+
+    def __init__(self, pairs: Sequence[tuple[float, float]] = ((1.0, 1.0),), factor: Callable | None = None):
+        self.pairs, self.factor = pairs, factor
+
+    @property
+    def single(self) -> 'Lag':
+        """The delay of the same first derivative."""
+        return Lag(factor=self.factor)
+
+    def delays(self, time: np.ndarray, values: np.ndarray) -> list[tuple[float, np.ndarray]]:
+        """Return (weight, delay in s, shape () or (n,)) of each."""
+        size = values[0] * (1.0 if self.factor is None else self.factor(time, values))
+        return [(weight, size * delay) for weight, delay in self.pairs]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Effect:
     """
@@ -66,7 +93,7 @@ class Effect:
     then an exact summary of the data.
 
     A *reference* effect (and a sensor's own lag) instead changes the motion that the sensor is thought to have felt: `warp`
-    gives tables and motions with weights, of which the reference is the weighted mean.
+    gives another table and motion, or the delays of a lag, over which the reference is the weighted mean.
 
     All properties of an effect are fields here; none is derived from its name.
     """
@@ -105,8 +132,8 @@ class Effect:
     """Sensor that each of the groups belongs to, where they differ; empty: all sensors that it acts on."""
     coefficients: Callable | None = None
     """``coefficients(effect, values, point) -> {group name: (n_columns, 3)}`` with `values` as `Values`."""
-    warp: Callable | None = None
-    """``warp(table, motion, values) -> [(weight, table, motion), ...]``."""
+    warp: Callable | Lag | None = None
+    """A `Lag`, or ``warp(table, motion, values) -> (table, motion)``."""
     derivative: Callable | None = None
     """``derivative(ref) -> (n, 3 size)``: the same as the central difference of `warp` for the true input, where it has a closed form."""
     acts_on: tuple = SENSORS

@@ -6,18 +6,21 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.effects.base import SENSORS, Effect, Role
+from imu_calibration.effects.base import SENSORS, Effect, Lag, Role
 from imu_calibration.effects.sensor_model import WARP, WARP_LEVER, SensorModel
 from imu_calibration.kinematics.chain import reference_motion
-from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.joint_motion import JointMotion, shifted
 from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.table import Table
 
 
 def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
-                     values: dict[str, np.ndarray] | None = None, roughly: bool = False) -> Reference:
+                     values: dict[str, np.ndarray] | None = None, roughly: bool = False,
+                     shifts: dict[tuple, list] | None = None) -> Reference:
     """
     Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
+
+    The motion is shifted once by the sum of all lags; errors of table and encoders act on the shifted motion.
 
     Parameters
     ----------
@@ -25,9 +28,12 @@ def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: J
         Effect name -> values that replace the point of the effect.
     roughly : bool
         Approximate a lag by a delay of the same first derivative; a filter averages several delays and costs as many times more.
+    shifts : dict, optional
+        Lags -> (weight, shifted motion) pairs of earlier calls with this motion; new ones are added.
 
     """
-    branches = [(1.0, table, motion)]
+    lags: list[Any] = [roughly]
+    delays, changes = [(1.0, np.zeros(()))], []
     for effect in model.concerning(sensor):
         if effect.warp is None:
             continue
@@ -35,9 +41,20 @@ def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: J
         at = model.point_of(effect) if at is None else np.atleast_1d(at)
         if not np.any(at):
             continue
-        warp = getattr(effect.warp, 'single', effect.warp) if roughly else effect.warp
-        branches = [(weight * w, t, m) for weight, a, b in branches for w, t, m in warp(a, b, at)]
-    references = [(weight, reference_motion(t, m, temperature_c)) for weight, t, m in branches]
+        if not isinstance(effect.warp, Lag):
+            changes.append((effect.warp, at))
+            continue
+        lag = effect.warp.single if roughly else effect.warp
+        lags += [effect.name, *at]
+        delays = [(weight * w, delay + d) for weight, delay in delays for w, d in lag.delays(motion.time, at)]
+    known, key, references = {} if shifts is None else shifts, tuple(lags), []
+    if key not in known:
+        known[key] = [(weight, shifted(motion, delay)) for weight, delay in delays]
+    for weight, felt in known[key]:
+        there = table
+        for warp, at in changes:
+            there, felt = warp(there, felt, at)
+        references.append((weight, reference_motion(there, felt, temperature_c)))
     return mean_reference(references, motion)
 
 
@@ -62,6 +79,7 @@ class References:
     def __init__(self, model: SensorModel, table: Table, motion: JointMotion, *, temperature_c: np.ndarray | None = None):
         self.model, self.table, self.motion, self.temperature_c = model, table, motion, temperature_c
         self._known: dict[tuple, Reference] = {}
+        self._shifts: dict[tuple, list] = {}
 
     def at(self, sensor: str, effect: Effect | None = None, values: np.ndarray | None = None, *, roughly: bool = False) -> Reference:
         """Return the reference of `sensor`, with other values for one effect where given; `roughly` as in `warped_reference`."""
@@ -73,7 +91,7 @@ class References:
         key = (roughly, acting, *moved)
         if key not in self._known:
             self._known[key] = warped_reference(self.model, sensor, self.table, motion=self.motion, temperature_c=self.temperature_c,
-                                                values=change, roughly=roughly)
+                                                values=change, roughly=roughly, shifts=self._shifts)
         return self._known[key]
 
 

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.effects.base import ATTITUDE, LOAD, MATRIX, PREFIXES, PRODUCT_PAIRS, SENSORS, Effect, Role
+from imu_calibration.effects.base import ATTITUDE, LOAD, MATRIX, PREFIXES, PRODUCT_PAIRS, SENSORS, Effect, Lag, Role
 from imu_calibration.kinematics.chain import WOBBLES, tilt, with_axis_angles, with_axis_places, with_sag, with_wobble
 from imu_calibration.kinematics.joint import JointNames
-from imu_calibration.kinematics.joint_motion import JointMotion, shifted, with_encoder_harmonics
-from imu_calibration.kinematics.table import Table
+from imu_calibration.kinematics.joint_motion import with_encoder_harmonics
 
 FIRST_ORDER = tuple(zip(*reversed(np.polynomial.laguerre.laggauss(5))))
 """(weight, delay) pairs that make an exponential lag a weighted mean of delays: int e^-x f(t - tau x) dx."""
@@ -44,22 +43,6 @@ _LAG_COLUMNS = {
 """Ending of the name -> (component, (weight, delay) pairs, description). All have the same first derivative."""
 
 
-class _Lag:
-    """A weighted mean of delays, all of which are in proportion to one value."""
-
-    def __init__(self, pairs):
-        self.pairs = pairs
-
-    @property
-    def single(self) -> '_Lag':
-        """The delay of the same first derivative."""
-        return _Lag(((1.0, 1.0),))
-
-    def __call__(self, table: Table, motion: JointMotion, values: np.ndarray) -> list[tuple[float, Table, JointMotion]]:
-        """Return (weight, table, motion) of each."""
-        return [(weight, table, shifted(motion, values[0] * delay)) for weight, delay in self.pairs]
-
-
 def _lag_effect(sensor, ending):
     component, pairs, does = _LAG_COLUMNS[ending]
     return Effect(
@@ -67,7 +50,7 @@ def _lag_effect(sensor, ending):
         explanation=f'The {sensor} {does}.', tolerance=1e-4, prior_sd=0.1, plausible=(('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),),
         tolerance_reason=('1 mg while the specific force changes by 100 m/s^3' if sensor == 'accelerometer'
                           else '0.1 deg/s while the rate changes by 1000 deg/s^2'),
-        motion=('oscillate_fast',), compensation='none', warp=_Lag(pairs), acts_on=(sensor,), needs=('joints', 'dynamic'), step=2e-4)
+        motion=('oscillate_fast',), compensation='none', warp=Lag(pairs), acts_on=(sensor,), needs=('joints', 'dynamic'), step=2e-4)
 
 
 def lag_name(sensor: str, ending: str) -> str:
@@ -124,7 +107,7 @@ def _changed(change, table, values):
 
 def _of_table(change, table, motion, values):
     """Return the warp of an effect that changes the table: ``change(table, values)``."""
-    return [(1.0, _changed(change, table, tuple(values)), motion)]
+    return _changed(change, table, tuple(values)), motion
 
 
 def _tilt_derivative(ref):
@@ -136,7 +119,7 @@ def _zero(table, motion, values):
     """Shift the joints between the first and the last: the first one's zero is the azimuth, the last one's belongs to the mount."""
     offset = np.zeros(motion.position.shape[1])
     offset[_columns(table, table.joint_names.zeros)] = values
-    return [(1.0, table, replace(motion, position=motion.position + offset))]
+    return table, replace(motion, position=motion.position + offset)
 
 
 def _columns(table, names):
@@ -148,19 +131,15 @@ def _harmonics(table, motion, values):
     amplitudes[_columns(table, table.joint_names.turning)] = np.reshape(values, (-1, len(ENCODER_ORDERS), 2))
     for index, order in enumerate(ENCODER_ORDERS):
         motion = with_encoder_harmonics(motion, order, amplitudes[:, index, 0], sin_amplitude=amplitudes[:, index, 1])
-    return [(1.0, table, motion)]
+    return table, motion
 
 
-def _late(table, motion, values):
-    return [(1.0, table, shifted(motion, values[0]))]
+def _elapsed(time, values):
+    return time
 
 
-def _late_with_time(table, motion, values):
-    return [(1.0, table, shifted(motion, values[0] * motion.time))]
-
-
-def _late_after(table, motion, values):
-    return [(1.0, table, shifted(motion, values[0] * (motion.time >= values[1])))]
+def _after(time, values):
+    return time >= values[1]
 
 
 def _earth(effect, values, point):
@@ -260,19 +239,19 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             explanation='The IMU stamps are late against the joint stamps.',
             tolerance=1e-4, tolerance_reason='0.1 mrad at 1 rad/s', prior_sd=0.1,
             plausible=(('bench', 0.05, 'field catalogue 6.3: 1-20 ms on serial paths'),),
-            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=_late, needs=('joints', 'dynamic'), step=2e-4),
+            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=Lag(), needs=('joints', 'dynamic'), step=2e-4),
         Effect(
             name='clock_rate', sensor='reference', components=('rate',), shape=(), unit='s/s', nuisance=True, against=('time',),
             explanation='The clock of the IMU stamps runs at another rate than that of the joint stamps: the lag grows linearly with time.',
             tolerance=1e-6, tolerance_reason='0.6 ms in 10 min', prior_sd=1e-3,
             plausible=(('bench', 5e-4, 'crystal oscillators: 10-100 ppm over temperature'),),
-            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=_late_with_time, needs=('joints', 'dynamic'), step=1e-6),
+            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=Lag(factor=_elapsed), needs=('joints', 'dynamic'), step=1e-6),
         Effect(
             name='clock_step', sensor='reference', components=('step', 'time'), shape=(2,), unit='s', nuisance=True, against=('time',),
             explanation='The clock of the IMU stamps is set at one moment: the lag changes by a step.',
             tolerance=1e-4, tolerance_reason='as the time offset', prior=(0.0, 60.0), prior_sd=(0.1, 1.0),
             plausible=(('bench', 0.05, 'as the time offset'),), located=True,
-            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=_late_after, needs=('joints', 'dynamic'), step=2e-4),
+            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=Lag(factor=_after), needs=('joints', 'dynamic'), step=2e-4),
         Effect(
             name='earth_rate', sensor='reference', components=('x', 'y', 'z'), shape=(3,), unit='rad/s', nuisance=True,
             title='Earth rate in the level frame', known_size=True, moot=_earth_known,
