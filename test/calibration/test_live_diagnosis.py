@@ -10,7 +10,6 @@ from test_live_calibration import assert_same, blocks
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.diagnosis.live_diagnosis import Answer, DiagnosisState, describe, question_about
-from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.session import LiveSettings
@@ -274,9 +273,8 @@ def test_who_saves_waits_for_the_answer_and_asks_the_same_once():
     assert thread.n_answers == 2 and thread.state.message == 'second'
 
 
-def test_what_stays_unexplained_is_said(station):
-    evidence = station.live.last.evidence()
-    diagnosis = told(station.live.table, evidence.found)
+def test_what_stays_unexplained_is_said(expected):
+    diagnosis = expected.diagnosis
     rest = {sensor: replace(found, significant=sensor == 'gyroscope', rms=1e-3) for sensor, found in diagnosis.unexplained.items()}
     state = describe(replace(diagnosis, findings=(), unexplained=rest))
     assert state.word == 'unexplained' and state.message.startswith('unexplained: ') and 'gyroscope' in state.message
