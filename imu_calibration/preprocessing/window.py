@@ -130,14 +130,14 @@ WINDOW_GROUP_SAMPLES = 4096
 
 
 def chunks(windows: Sequence[Window]) -> Iterator[list[Window]]:
-    """Yield the windows in groups of more than `WINDOW_GROUP_SAMPLES` samples, in order."""
+    """Yield the windows in groups of at most `WINDOW_GROUP_SAMPLES` samples, or of a single longer window, in order."""
     part, size = [], 0
     for window in windows:
-        part.append(window)
-        size += len(window.motion)
-        if size > WINDOW_GROUP_SAMPLES:
+        if part and size + len(window.motion) > WINDOW_GROUP_SAMPLES:
             yield part
             part, size = [], 0
+        part.append(window)
+        size += len(window.motion)
     if part:
         yield part
 

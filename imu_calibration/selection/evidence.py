@@ -17,7 +17,7 @@ from imu_calibration.selection.reduced_recording import Recent
 MIN_FOLD_WINDOWS = 8
 """Least number of windows for held-out folds."""
 MOST_FITS = 128
-"""Fits kept with their covariances: a search tries thousands of choices, and asks for the last again."""
+"""Fits kept with covariances or predictions: a search tries thousands of choices, and asks for the last again."""
 EVIDENCE_FOLDS = 6
 """Parts that are held out in turn."""
 LEAST_SCATTER = 20
@@ -64,7 +64,7 @@ class Evidence:
         self.total, self.without, self._prior = total, without, {'prior_sd': prior_sd, 'prior_mean': prior_mean}
         self._fits: dict[tuple, tuple] = Recent(MOST_FITS)
         self._losses: dict[tuple, float] = {}
-        self._predictions: dict[tuple, np.ndarray] = {}
+        self._predictions: dict[tuple, np.ndarray] = Recent(MOST_FITS)
 
     def equations(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (matrix, right side) of the normal equations of all parameters on all rows, with the prior."""

@@ -104,7 +104,7 @@ PARTS = ('within', 'slow')
 """Triangular factors of a window: of all centred rows, and of the means of short pieces."""
 REDUCING = 'reducing the recording'
 """Phase of the progress."""
-UNPACKED_WINDOWS = 32
+UNPACKED_WINDOWS = 8
 """Windows whose factors are unpacked at a time."""
 MOST_SUMS = 32
 """Sums of products kept: the folds of every kind of window, for the next axis."""

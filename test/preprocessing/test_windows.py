@@ -1,5 +1,7 @@
 """Windows found in simulated sessions, whatever the rates, the faults and the way the streams arrive."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +15,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.spike_filter import SPIKE_REACH
 from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT
-from imu_calibration.preprocessing.window import WindowSettings
+from imu_calibration.preprocessing.window import WINDOW_GROUP_SAMPLES, WindowSettings, chunks
 from imu_calibration.preprocessing.window_cutter import MIN_MOVING_SECONDS, WanderLimit
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
@@ -517,3 +519,11 @@ def test_long_motion_of_a_quiet_imu_is_cut_short_and_rests_are_not():
     found = [gather(*record(Profile('', tuple(builder.segments)), force_noise=noise))[0] for noise in (1e-4, 5e-3)]
     longest = [max(window.time[-1] - window.time[0] for window in of_kind(windows, kind)) for windows in found for kind in ('dynamic', 'static')]
     assert longest[0] <= MIN_MOVING_SECONDS + 0.01 and longest[2] > 10.0 and min(longest[1], longest[3]) > 7.0
+
+
+def test_columns_of_a_chunk_need_the_memory_of_one_chunk():
+    """Windows in groups of at most WINDOW_GROUP_SAMPLES samples, a longer one alone: the columns of a group are in memory at once."""
+    sizes = [WINDOW_GROUP_SAMPLES - 1, WINDOW_GROUP_SAMPLES - 1, 1, 1, 3 * WINDOW_GROUP_SAMPLES, 5]
+    groups = [[len(window.motion) for window in group] for group in chunks([SimpleNamespace(motion=range(size)) for size in sizes])]
+    assert groups == [[WINDOW_GROUP_SAMPLES - 1], [WINDOW_GROUP_SAMPLES - 1, 1], [1], [3 * WINDOW_GROUP_SAMPLES], [5]]
+    assert list(chunks([])) == []

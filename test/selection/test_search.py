@@ -1,6 +1,7 @@
 """The guards of the search, each in a case in which it alone stands between the tool and a false claim."""
 
 from dataclasses import replace
+from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +15,7 @@ from imu_calibration.estimation.noise_search import FLICKER_MARK, BiasProcessSea
 from imu_calibration.selection import gain, investigation
 from imu_calibration.selection import unexplained as rests
 from imu_calibration.selection.attempt import Attempt
-from imu_calibration.selection.evidence import Evidence, WindowEvidence, folds_of, locked_windows
+from imu_calibration.selection.evidence import MOST_FITS, Evidence, WindowEvidence, folds_of, locked_windows
 from imu_calibration.selection.explained_share import SHOWS, Explained, ExplainedWindows, pruned
 from imu_calibration.selection.noise_beside_effects import _needed_smooth, drift_prior, natural_processes, plausible_processes
 from imu_calibration.selection.parameter_space import ParameterSpace, parameter_space, scatter_of_each, white_means
@@ -108,6 +109,19 @@ def test_noise_gains_nothing_where_it_was_not_fitted():
         gained.append((evidence.loss([0]) - evidence.loss(range(4)), evidence.heldout([0]) - evidence.heldout(range(4))))
     fitted, held_out = np.mean(gained, axis=0)
     assert fitted > 2.0 and held_out < -2.0
+
+
+def test_memory_of_a_search_does_not_grow_with_the_choices_it_tried():
+    """A search tries thousands; only their losses are kept, and the last fits and predictions, which come out the same again."""
+    parts = np.array([rows.T @ rows for rows in np.random.default_rng(1).normal(size=(6, 20, 11))])
+    evidence = Evidence(parts.sum(axis=0), parts.sum(axis=0) - parts, prior_sd=np.full(10, 1e3), prior_mean=np.zeros(10))
+    tried = list(combinations(range(10), 4))
+    first = evidence.left_by_others(tried[0])
+    for choice in tried:
+        evidence.heldout(choice)
+    kept = [each for each in vars(evidence).values() if isinstance(each, dict) and any(isinstance(v, np.ndarray) for v in each.values())]
+    assert len(tried) > MOST_FITS and max(map(len, kept)) == MOST_FITS
+    np.testing.assert_array_equal(evidence.left_by_others(tried[0]), first)
 
 
 def test_offsets_of_windows_are_in_the_weights_of_the_evidence():
