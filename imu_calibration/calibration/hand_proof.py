@@ -10,7 +10,7 @@ from imu_calibration.compensation.compensate import Corrected, compensate
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import LAST_SHARE, Uncorrected, uncorrected_in_time
 from imu_calibration.effects.forward_equations import applied_values
-from imu_calibration.estimation.scaled_solve import scaled_lstsq
+from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular_of_band
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, TurnData, between_middles
@@ -80,11 +80,11 @@ def values_without(hand: HandCalibration, turns: Sequence[TurnData], folds: Sequ
     rows = np.column_stack([system.nuisance, system.main[:, free], system.residual])
     rows /= np.sqrt(system.noise + scatter[system.component])[:, None]
     prior = np.column_stack([np.diag(1.0 / model.priors), (model.nominal - hand.values) / model.priors])[free][:, np.append(free, True)]
-    known, found = np.pad(prior, ((0, 0), (system.nuisance.shape[1], 0))), []
+    found, last = [], slice(system.nuisance.shape[1], None)
     for out in folds:
-        kept = np.concatenate([rows[~np.append(out, False)[system.group].any(axis=1)], known])
+        kept = np.concatenate([triangular_of_band(rows[~np.append(out, False)[system.group].any(axis=1)])[last, last], prior])
         moved = hand.values.copy()
-        moved[free] += scaled_lstsq(kept[:, :-1], kept[:, -1])[-len(prior):]
+        moved[free] += scaled_lstsq(kept[:, :-1], kept[:, -1])
         found.append(moved)
     return found
 

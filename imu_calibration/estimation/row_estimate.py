@@ -14,7 +14,7 @@ import scipy.linalg
 
 from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE
 from imu_calibration.estimation.noise_search import GroupVariances, estimate_group_variances
-from imu_calibration.estimation.scaled_solve import covariance_with_held
+from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, triangular_of_band
 
 MAX_NEWTON_STEPS = 15
 """Largest number of Gauss-Newton steps; four to six are usual."""
@@ -114,18 +114,14 @@ def choose_held(factor: np.ndarray, priors: np.ndarray, asked: np.ndarray) -> np
     held = np.zeros(len(priors), bool)
     while np.any(free := asked & ~held):
         ratio = np.zeros(len(priors))
-        ratio[free] = _data_sd(factor[:, free] * priors[free])
+        # the sds in units of the priors, nearly unlimited without information from the data
+        ratio[free] = np.sqrt(np.diag(inverse_gram(np.vstack([factor[:, free] * priors[free],
+                                                              np.eye(np.count_nonzero(free)) / FLAT_PRIOR_FACTOR]))))
         worst = int(np.argmax(ratio))
         if ratio[worst] <= 0.5:
             break
         held[worst] = True
     return held
-
-
-def _data_sd(scaled):
-    """Return the sd of parameters in units of their priors, nearly unlimited without information from the data."""
-    factor = np.linalg.qr(np.vstack([scaled, np.eye(scaled.shape[1]) / FLAT_PRIOR_FACTOR]), mode='r')
-    return np.linalg.norm(scipy.linalg.solve_triangular(factor, np.eye(len(factor))), axis=1)
 
 
 def _iterate(reference, state, free, priors, *, variance, fallback):
@@ -142,13 +138,13 @@ def _iterate(reference, state, free, priors, *, variance, fallback):
         if number > 2:  # after the first steps there are errors of linearisation that are not scatter
             scatter = estimate_group_variances(design, residual, noise, group=group, start=scatter.variance, fallback=fallback)
         root = np.sqrt(scatter.total(noise, group))
-        orthogonal, factor = np.linalg.qr(design / root[:, None])
-        reduced = scipy.linalg.solve_triangular(factor, orthogonal.T @ (residual / root))
+        factor = triangular_of_band(np.column_stack([design, residual]) / root[:, None])[:-1]
+        reduced = scipy.linalg.solve_triangular(factor[:, :-1], factor[:, -1])
         step = np.zeros(n_nuisances + len(free))
         step[np.append(np.ones(n_nuisances, bool), free)] = reduced
         state = reference.moved(state, step)
         settled = np.allclose(scatter.variance, before, rtol=0.01, atol=1e-4 * np.min(fallback))
-        if number > 3 and settled and np.linalg.norm(factor @ reduced) < 1e-3:  # in units of the joint sd
+        if number > 3 and settled and np.linalg.norm(factor[:, -1]) < 1e-3:  # in units of the joint sd
             break
     return state, scatter, number
 
@@ -156,14 +152,16 @@ def _iterate(reference, state, free, priors, *, variance, fallback):
 def _factor(rows, scatter):
     """Return the triangular factor of the parameters with the nuisances eliminated, at inflated variances."""
     root, width = np.sqrt(scatter.total(rows.noise, rows.component, inflated=True)), rows.nuisance.shape[1]
-    return np.linalg.qr(np.hstack([rows.nuisance, rows.main]) / root[:, None], mode='r')[width:, width:]
+    return triangular_of_band(np.hstack([rows.nuisance, rows.main]) / root[:, None])[width:, width:]
 
 
 def _of_scatter(rows, scatter, free):
     """Return the part of the covariance that is due to the scatter of the components beyond the noise, shape (n, n)."""
     variance = scatter.total(rows.noise, rows.component, inflated=True)
-    orthogonal, factor = np.linalg.qr(np.hstack([rows.nuisance, rows.main[:, free]]) / np.sqrt(variance)[:, None])
-    gain = scipy.linalg.solve_triangular(factor, orthogonal.T)[rows.nuisance.shape[1]:] * np.sqrt(1 - rows.noise / variance)
+    design = np.hstack([rows.nuisance, rows.main[:, free]]) / np.sqrt(variance)[:, None]
+    factor = triangular_of_band(design)
+    orthogonal = scipy.linalg.solve_triangular(factor, design.T, trans='T')
+    gain = scipy.linalg.solve_triangular(factor, orthogonal)[rows.nuisance.shape[1]:] * np.sqrt(1 - rows.noise / variance)
     found = np.zeros((len(free),) * 2)
     found[np.ix_(free, free)] = gain @ gain.T
     return found

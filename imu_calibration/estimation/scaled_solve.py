@@ -28,6 +28,27 @@ def triangular(rows: np.ndarray) -> np.ndarray:
     return np.triu(factor)
 
 
+BAND_COLUMNS = 20
+"""Columns that are eliminated at a time."""
+
+
+def triangular_of_band(rows: np.ndarray) -> np.ndarray:
+    """
+    Return the triangular factor of `rows`, shape (n, n); rows that begin in the same columns are reflected together.
+
+    With the elements near a diagonal, and dense columns last, the cost is proportional to the number of rows.
+    """
+    band, factor, carried = np.argmax(rows != 0, axis=1) // BAND_COLUMNS, np.zeros((rows.shape[1],) * 2), rows[:0]
+    for number in range(-(-len(factor) // BAND_COLUMNS)):
+        own = np.concatenate([carried, rows[band == number]])
+        used = np.flatnonzero(own.any(axis=0))
+        part, done = np.linalg.qr(own[:, used], mode='r'), np.searchsorted(used, (number + 1) * BAND_COLUMNS)
+        carried = np.zeros((len(part), len(factor)))
+        carried[:, used] = part
+        factor[used[:len(part[:done])]], carried = carried[:done], carried[done:]
+    return factor
+
+
 @dataclass(frozen=True, eq=False)
 class PackedFactor:
     """A triangular factor without the zeros below its diagonal: half the memory of a square one."""

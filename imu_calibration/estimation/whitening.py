@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import lapack, solve_triangular
 
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
-from imu_calibration.estimation.scaled_solve import JITTER
+from imu_calibration.estimation.scaled_solve import JITTER, triangular_of_band
 
 
 class Whitening:
@@ -183,14 +183,14 @@ class RestrictedLikelihood:
         """Return the same of the rows of some axes only."""
         return RestrictedLikelihood(self._rows[:, axes], self._times, self._sessions, information=self._information)
 
-    def __call__(self, variance: np.ndarray, processes: Sequence[BiasProcess] = (), session_variance: float = 0.0) -> float:
-        """Return the value for independent variances of the rows, shape (n, n_axes), bias processes and an offset per session."""
-        logs, normal = self.whitened(variance, processes, session_variance)
-        return logs + profile(normal)
-
     def whitened(self, variance: np.ndarray, processes: Sequence[BiasProcess] = (), session_variance: float = 0.0) -> tuple[float,
                                                                                                                             np.ndarray]:
-        """Return log|V| and the normal matrix of ``[design | residual]`` weighted with V^-1, `information` included."""
+        """
+        Return log|V| and the normal matrix of ``[design | residual]`` weighted with V^-1, `information` included.
+
+        For independent variances of the rows, shape (n, n_axes), bias processes and an offset per session; the likelihood is log|V| plus the
+        `profile` of the matrix.
+        """
         whitening = Whitening(variance, self._times, self._sessions, processes=processes, session_variance=session_variance)
         white = whitening(self._rows).reshape(-1, self._rows.shape[2])
         return whitening.log_determinant, self._information + white.T @ white
@@ -214,10 +214,10 @@ class RestrictedLikelihood:
 
         """
         white = Whitening(variance, self._times, self._sessions)(self._rows).reshape(-1, self._rows.shape[2])
-        left = np.linalg.qr(white[:, :-1])[0]
-        rest = white[:, -1] - left @ (left.T @ white[:, -1])
-        some = members.any(axis=0)   # the cost grows with the square of the rows
-        left, rest, weighted = left[some], rest[some], (members / variance.ravel())[:, some]
+        some, factor = members.any(axis=0), triangular_of_band(white)
+        white, weighted = white[some], (members / variance.ravel())[:, some]   # the cost grows with the square of the rows
+        left = solve_triangular(factor[:-1, :-1], white[:, :-1].T, trans='T').T
+        rest = white[:, -1] - left @ factor[:-1, -1]
         redundancy = 1 - np.einsum('ij,ij->i', left, left)
         return 0.5 * weighted @ (rest**2 - redundancy), 0.5 * weighted @ (np.eye(len(left)) - left @ left.T)**2 @ weighted.T
 

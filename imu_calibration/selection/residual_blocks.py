@@ -18,6 +18,7 @@ from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import ExplainedWindows
 from imu_calibration.selection.noise_beside_effects import natural_processes
 from imu_calibration.selection.questions import TEMPERATURE_SPAN
+from imu_calibration.selection.saturation import measured
 from imu_calibration.simulation.session import predict_windows
 
 MIN_BLOCK_SECONDS = 0.25
@@ -177,9 +178,9 @@ def _busier(windows, sensor, floor, kinds, judged):
 
 def residuals(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> dict[str, np.ndarray]:
     """Return sensor -> residual of every sample of all windows at some values, shape (n, 3): rows within blocks would be too coarse."""
-    outputs = (np.concatenate([w.force_s for w in windows]), np.concatenate([w.rate_s for w in windows]))
     predicted = [predict_windows(group, table, model, values=values) for group in chunks(windows)]   # columns need much memory
-    return {sensor: output - np.concatenate([part[sensor] for part in predicted]) for sensor, output in zip(SENSORS, outputs)}
+    return {sensor: np.concatenate([measured(window, sensor) for window in windows]) - np.concatenate([part[sensor] for part in predicted])
+            for sensor in SENSORS}
 
 
 def _block_means(attempt, table, motion, temperature, starts):

@@ -5,6 +5,7 @@ import pytest
 
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, dof_factor
 from imu_calibration.estimation.noise_search import NoiseLikelihood
+from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.whitening import RestrictedLikelihood, Whitening, predict_session_offsets, profile
 
 STEP = 1.3
@@ -24,6 +25,12 @@ def rows():
     numbers = np.repeat([0, 1, 2], [9, 7, 4])
     times, variance = np.sort(rng.uniform(0, 500, 20)), rng.uniform(0.5, 2, (20, 3))
     return rng.normal(size=(20, 3, 4)), times, variance, [np.flatnonzero(numbers == k) for k in range(3)]
+
+
+def value(likelihood, *noise):
+    """Return minus twice the restricted log likelihood."""
+    logs, normal = likelihood.whitened(*noise)
+    return logs + profile(normal)
 
 
 def dense(times, variance, sessions, processes):
@@ -85,7 +92,7 @@ def test_the_restricted_likelihood_is_that_of_contrasts_free_of_the_parameters(r
     design = values[:, :, :-1].transpose(1, 0, 2).reshape(60, 3)
     contrasts = np.linalg.svd(design)[0][:, 3:]
     for factor in (1.0, 3.0):
-        found.append(likelihood(factor * variance, processes, STEP**2))
+        found.append(value(likelihood, factor * variance, processes, STEP**2))
         whole = np.zeros((60, 60))
         for axis, matrix in enumerate(dense(times, factor * variance, sessions, processes)):
             whole[20 * axis:20 * axis + 20, 20 * axis:20 * axis + 20] = matrix
@@ -138,7 +145,7 @@ def test_scoring_is_the_derivative_of_the_likelihood(rows):
 
     at, step = np.array([0.5, 1.0, 2.0]), 1e-5 * np.eye(3)
     score, information = likelihood.scoring(variance(at), members)
-    slopes = [-0.5 * (likelihood(variance(at + h)) - likelihood(variance(at - h))) / 2e-5 for h in step]
+    slopes = [-0.5 * (value(likelihood, variance(at + h)) - value(likelihood, variance(at - h))) / 2e-5 for h in step]
     np.testing.assert_allclose(score, slopes, rtol=1e-5)
     rng, scores = np.random.default_rng(1), []
     for _ in range(4000):
@@ -146,3 +153,21 @@ def test_scoring_is_the_derivative_of_the_likelihood(rows):
         drawn[:, :, -1] = rng.normal(size=(20, 3)) * np.sqrt(variance(at))
         scores.append(RestrictedLikelihood(drawn, times, sessions).scoring(variance(at), members)[0])
     np.testing.assert_allclose(np.cov(np.array(scores).T), information, rtol=0.12, atol=0.03 * information.max())
+
+
+def test_factor_along_a_band_is_that_of_all_rows():
+    """Rows of a chain of poses, in any order, with common columns last and one pose without rows: the products agree, in small parts."""
+    rng, n_poses, largest = np.random.default_rng(8), 40, []
+    rows = np.zeros((n_poses, 12, 5 * n_poses + 7))
+    for pose in range(n_poses - 1):
+        rows[pose, :, 5 * pose:5 * pose + 10] = rng.normal(size=(12, 10))
+    rows[:, :, -7:] = rng.normal(size=(n_poses, 12, 7))
+    rows[:, :, 30:35] = 0.0
+    rows = rng.permutation(rows.reshape(-1, rows.shape[2]))
+    with pytest.MonkeyPatch.context() as patch:
+        qr = np.linalg.qr
+        patch.setattr(np.linalg, 'qr', lambda part, mode: largest.append(part.size) or qr(part, mode=mode))
+        factor = triangular_of_band(rows)
+    np.testing.assert_allclose(factor.T @ factor, rows.T @ rows, rtol=1e-12, atol=1e-12 * n_poses)
+    assert not np.tril(factor, -1).any()
+    assert max(largest) < 0.05 * rows.size

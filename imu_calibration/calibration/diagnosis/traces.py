@@ -14,6 +14,7 @@ from imu_calibration.kinematics.strapdown import drift_over
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, all_samples, chunks
 from imu_calibration.selection.gain import MEASURES, OF_MODEL, Gain, reduction_interval
+from imu_calibration.selection.residual_blocks import residuals
 from imu_calibration.selection.saturation import measured
 from imu_calibration.simulation.session import predict_windows
 
@@ -210,13 +211,13 @@ def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *
     models = before, after
     sums, parts, counts, warmth = DistanceSums(), [], [], []
     for group in chunks([window for window in windows if window.kind != 'unused']):
-        residuals, against = _errors(group, table, models), _variables(group, table, before)
+        rest, against = [residuals(group, table, each.model, values=each.values) for each in models], _variables(group, table, before)
         ends = np.cumsum([len(window) for window in group])
         for window, stop in zip(group, ends):
             rows = slice(stop - len(window), stop)
-            sums.add(window, [{sensor: own[rows] for sensor, own in each.items()} for each in residuals], before.noise)
+            sums.add(window, [{sensor: own[rows] for sensor, own in each.items()} for each in rest], before.noise)
         block, number, n_blocks = _blocks(group)
-        values = [np.concatenate([w.time for w in group]), *against[:3], *(each[s] for each in residuals for s in SENSORS)]
+        values = [np.concatenate([w.time for w in group]), *against[:3], *(each[s] for each in rest for s in SENSORS)]
         parts.append([_block_mean(value, block, number) for value in values])
         warmth.append(None if against[3] is None else _block_mean(against[3], block, number))
         counts.append((number, np.repeat([str(w.kind) for w in group], n_blocks)))
@@ -248,13 +249,6 @@ def _segment(windows, table, models, sensor, axis, start, stop):
     size = max(1, len(rows) // POINTS)
     rows = rows[:len(rows) // size * size].reshape(-1, size)
     return OverlaySegment(time[rows].mean(axis=1), {name: signal[rows].mean(axis=1) for name, signal in found.items()})
-
-
-def _errors(windows, table, models):
-    """Return sensor -> measured minus predicted, of each model."""
-    outputs = {sensor: np.concatenate([measured(window, sensor) for window in windows]) for sensor in SENSORS}
-    predicted = (predict_windows(windows, table, model.model, values=model.values) for model in models)
-    return [{sensor: outputs[sensor] - each[sensor] for sensor in SENSORS} for each in predicted]
 
 
 def _variables(windows, table, model):
@@ -308,7 +302,8 @@ def _drifts(windows, table, models):
     """Return the Drift of each model over the first `DEAD_RECKONING` seconds of some windows."""
     motion, temperature, rows = all_samples(windows)
     time, found = np.concatenate([window.time for window in windows]), []
-    for model, error in zip(models, _errors(windows, table, models)):
+    for model in models:
+        error = residuals(windows, table, model.model, values=model.values)
         reference, felt = _references(model, table, motion, temperature), {}
         for sensor in SENSORS:
             matrix = model.model.value(sensor, Role.LINEAR, model.values)

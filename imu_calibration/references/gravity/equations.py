@@ -18,6 +18,8 @@ SCATTER_SD = (0.002, 1e-4, 2e-3)
 """Their standard deviations when there are too few poses or turns to estimate them, m/s^2, rad/s, rad."""
 
 
+OF_DIRECTION, OF_DRIFT = slice(0, 2), slice(2, 5)
+"""Nuisances of a pose: components of its direction, departure of the gyroscope's bias; pose after pose, so that the rows form a band."""
 MAX_FIRST_ORDER_ANGLE = 1e-3
 """rad; its square, times a turn's few radians, is the error of the first-order correction."""
 CALM = 0.05
@@ -119,11 +121,10 @@ class GravityRows:
     fixed = property(lambda self: self.model.fixed)
 
     def moved(self, state: State, step: np.ndarray) -> State:
-        """Return the state after a step: 2 components per direction, 3 per drift, then the parameters."""
-        count = len(state.up)
-        up = state.up + np.einsum('kij,kj->ki', tangent(state.up), step[:2 * count].reshape(-1, 2))
-        return State(state.values + step[5 * count:], up / np.linalg.norm(up, axis=1, keepdims=True),
-                     state.drift + step[2 * count:5 * count].reshape(-1, 3))
+        """Return the state after a step: pose after pose 2 components of its direction and 3 of its drift, then the parameters."""
+        own = step[:5 * len(state.up)].reshape(-1, 5)
+        up = state.up + np.einsum('kij,kj->ki', tangent(state.up), own[:, :2])
+        return State(state.values + step[own.size:], up / np.linalg.norm(up, axis=1, keepdims=True), state.drift + own[:, 2:])
 
     def linearise(self, state: State) -> RowSet:
         """Return the rows of poses, bias drifts, calm drifts and turns at a state."""
@@ -146,35 +147,21 @@ def _pose_rows(model, state, poses, across):
     for i in range(3):
         main[:, i, 3 + 3 * i:4 + 4 * i] = true[:, :i + 1]
     main[:, :, model.extra_index('accelerometer')] = slopes
-    nuisance = np.zeros((count, 3, 5 * count))
-    blocks = model.gravity * matrix @ across
-    for k in range(count):
-        nuisance[k, :, 2 * k:2 * k + 2] = blocks[k]
-    return _flat(poses.force - bias - true @ matrix.T - more, nuisance, main, poses.force_sem**2, 0)
+    return _flat(poses.force - bias - true @ matrix.T - more, OF_DIRECTION, model.gravity * matrix @ across, main, poses.force_sem**2, 0)
 
 
 def _drift_rows(model, state, poses):
     """``rate = bias + further effects (gravity * up) + drift`` at rest."""
-    count = len(state.up)
-    true = model.gravity * state.up
-    more, slopes = model.further('gyroscope', state.values, true, **poses.conditions)
-    main = np.zeros((count, 3, model.size))
+    more, slopes = model.further('gyroscope', state.values, model.gravity * state.up, **poses.conditions)
+    main = np.zeros((len(slopes), 3, model.size))
     main[:, :, model.gyro_bias] = np.eye(3)
     main[:, :, model.extra_index('gyroscope')] = slopes
-    return _flat(poses.rate - state.values[model.gyro_bias] - more - state.drift, _drift_columns(count), main, poses.rate_sem**2, -1)
+    return _flat(poses.rate - state.values[model.gyro_bias] - more - state.drift, OF_DRIFT, np.eye(3), main, poses.rate_sem**2, -1)
 
 
 def _calm_rows(model, state, poses):
     """``0 = drift`` within the scatter of the drifts."""
-    count = len(state.up)
-    return _flat(-state.drift, _drift_columns(count), np.zeros((count, 3, model.size)), (CALM * poses.rate_sem)**2, 1)
-
-
-def _drift_columns(count):
-    nuisance = np.zeros((count, 3, 5 * count))
-    for k in range(count):
-        nuisance[k, :, 2 * count + 3 * k:2 * count + 3 * k + 3] = np.eye(3)
-    return nuisance
+    return _flat(-state.drift, OF_DRIFT, np.eye(3), np.zeros((len(state.up), 3, model.size)), (CALM * poses.rate_sem)**2, 1)
 
 
 def _integrated(model, state, data, bias, key, memory):
@@ -200,21 +187,20 @@ def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndar
 
 def _gravity_turn_rows(model, state, data, key, memory, across, poses):
     """The direction before the turn, rotated by the gyroscope, against the direction after it: two rows, from middle to middle."""
-    count, i, j = len(state.up), data.first, data.last
+    i, j = data.first, data.last
     mat_ji, turn = _integrated(model, state, data, state.values[model.gyro_bias] + 0.5 * (state.drift[i] + state.drift[j]), key, memory)
     mat_ji = between_middles(poses, data, mat_ji)
     carried = mat_ji @ state.up[i]
     across_i, across_j = across[i], across[j]
     by_psi = across_j.T @ skew(carried)
-    main, nuisance = np.zeros((2, model.size)), np.zeros((2, 5 * count))
+    main, nuisance = np.zeros((2, model.size)), np.zeros((2, len(state.up), 5))
     main[:, model.gyro_bias] = by_psi @ turn.by_bias
     main[:, model.gyro_matrix] = by_psi @ turn.by_matrix.reshape(3, 9)
     main[:, model.extra_index('gyroscope')] = by_psi @ turn.by_further
-    nuisance[:, 2 * i:2 * i + 2] += across_j.T @ mat_ji @ across_i
-    nuisance[:, 2 * j:2 * j + 2] -= (carried @ state.up[j]) * np.eye(2)
-    for pose in (i, j):
-        nuisance[:, 2 * count + 3 * pose:2 * count + 3 * pose + 3] += 0.5 * main[:, model.gyro_bias]
-    return -across_j.T @ carried, nuisance, main, np.full(2, data.noise_variance), np.full(2, 2), np.tile([i, j], (2, 1))
+    nuisance[:, i, OF_DIRECTION] = across_j.T @ mat_ji @ across_i
+    nuisance[:, j, OF_DIRECTION] = -(carried @ state.up[j]) * np.eye(2)
+    nuisance[:, [i, j], OF_DRIFT] = 0.5 * main[:, None, model.gyro_bias]
+    return -across_j.T @ carried, nuisance.reshape(2, -1), main, np.full(2, data.noise_variance), np.full(2, 2), np.tile([i, j], (2, 1))
 
 
 def _known_turn_rows(model, state, data):
@@ -241,6 +227,9 @@ def _further_of_turn(model, state, data, bias):
     return model.further('gyroscope', state.values, force, rate=rate, time=data.time, temperature_c=data.temperature_c)
 
 
-def _flat(residual, nuisance, main, noise, component):
-    return (residual.ravel(), nuisance.reshape(-1, nuisance.shape[-1]), main.reshape(-1, main.shape[-1]), noise.ravel(),
-            np.full(residual.size, component), np.repeat(np.arange(len(residual)), 3)[:, None].repeat(2, axis=1))
+def _flat(residual, place, blocks, main, noise, component):
+    """Return three rows per pose; `blocks`: their columns of the pose's own nuisances at `place`."""
+    own, nuisance = np.arange(len(residual)), np.zeros((*residual.shape, len(residual), 5))
+    nuisance[own, :, own, place] = blocks
+    return (residual.ravel(), nuisance.reshape(residual.size, -1), main.reshape(residual.size, -1), noise.ravel(),
+            np.full(residual.size, component), np.repeat(own, 3)[:, None].repeat(2, axis=1))

@@ -4,12 +4,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from imu_calibration.core.distributions import chance_of_fall
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.covariance_terms import GRAVITY, UNMODELLED_EARTH_RATE, total
 from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, ModelError, model_error_of_rows
 from imu_calibration.estimation.row_estimate import MAX_NEWTON_STEPS, RowEstimate, estimate_rows
+from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solver import OUTLIER_P_VALUE
 from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
@@ -142,7 +144,8 @@ def _whitened(rows, found):
     root = np.sqrt(found.scatter.total(rows.noise, rows.component))
     design = np.hstack([rows.nuisance, rows.main[:, found.free]]) / root[:, None]
     rest = rows.residual / root
-    basis = np.linalg.qr(np.vstack([design, np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)]))[0][:len(rest)]
+    factor = triangular_of_band(np.vstack([design, np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)]))
+    basis = solve_triangular(factor, design.T, trans='T').T
     return rest - basis @ (basis.T @ rest), basis
 
 
