@@ -222,7 +222,7 @@ class FormulaSearch:
         self.blocks, self.formulas = blocks, formulas
         self._place = {text: k for k, text in enumerate(dict.fromkeys(t for f in formulas for column in f.columns for t in _three(column)))}
         self.means = self._worked_out(tuple(self._place), reference_temperature)
-        whiten = blocks.whitener(~blocks.locked)
+        whiten = blocks.white[0]
         every = whiten(np.concatenate([*blocks.design, self.means], axis=1))
         ends = np.cumsum([0, *(part.shape[1] for part in blocks.design)])
         self._rest, self._free, self.known = [], [], []

@@ -10,7 +10,7 @@ from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.regime_variables import FEWEST, Variable, variables_of
-from imu_calibration.selection.residual_blocks import RestBlocks
+from imu_calibration.selection.residual_blocks import BlockWhitener, RestBlocks
 
 REGIME_LEVEL = 0.05
 """Probability that a recording without a place has one reported, for all axes of a sensor together."""
@@ -97,18 +97,14 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
     for axis, name in enumerate(AXES):
         offsets = []
         if name in axes:
-            white = white or blocks.whitener(np.ones(len(blocks.time), bool))
+            white = white or BlockWhitener(blocks, np.ones(len(blocks.time), bool))
             at = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
-            own, scaled = blocks.index[axis][at], partial(_scaled, white, white.scale[axis])
+            own, scaled = blocks.index[axis][at], partial(white, axis=axis)
             prior = 1 / attempt.space.prior_sd[own]**2, attempt.space.prior_mean[own]
             rest = AxisResidual(scaled(blocks.design[axis][:, [*at, -1]]), *prior)
             offsets = search.offsets(name, rest, scaled, level=level / 2, formula=None if formula is None else formula[:, :, axis])
         found += offsets or search.scatters(name, blocks.rough[:, axis], blocks.freedom, level=level / 2)
     return found
-
-
-def _scaled(white, scale, columns):
-    return white(columns) / scale
 
 
 def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray, *, seed: int = 0) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -71,26 +72,27 @@ class RestBlocks:
         """Return means over the blocks of something known at the rows, shape (b, ...)."""
         return block_means(rows, self.starts)
 
-    def whitener(self, select: np.ndarray) -> 'BlockWhitener':
-        """Return the whitener of the blocks `select` (mask): independent, of unit variance."""
-        return BlockWhitener(self, select)
+    @cached_property
+    def white(self) -> list['BlockWhitener']:
+        """Whiteners of the blocks outside locked windows and of those inside; large, therefore shared by the fits of all choices."""
+        return [BlockWhitener(self, ~self.locked), BlockWhitener(self, self.locked)]
 
 
 class BlockWhitener:
-    """Makes rows of some blocks independent: white noise of each block and a bias that moves."""
+    """Makes rows of the blocks `select` (mask) independent, of unit variance: white noise of each block and a bias that moves."""
 
     def __init__(self, blocks: RestBlocks, select: np.ndarray):
         variance, time = blocks.variance[select], blocks.time[select]
-        self.scale = np.sqrt(np.median(variance / variance.mean(axis=1, keepdims=True), axis=0))
+        self.scale = np.append(np.sqrt(np.median(variance / variance.mean(axis=1, keepdims=True), axis=0)), 1.0)
         apart = np.abs(time[:, None] - time[None, :])
         covariance = np.diag(variance.mean(axis=1))
         for process in blocks.processes:
             covariance += process.sd**2 * np.exp(-apart / process.time)
         self._factor, self._select = np.linalg.cholesky(covariance), select
 
-    def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """Return whitened rows, shape of the selection; divide by ``scale[axis]`` for an axis."""
-        return solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False)
+    def __call__(self, rows: np.ndarray, axis: int = -1) -> np.ndarray:
+        """Return whitened rows of an axis, shape of the selection; without `axis` they are to be divided by ``scale[axis]``."""
+        return solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False) / self.scale[axis]
 
 
 def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, explained: ExplainedWindows) -> dict[str, RestBlocks]:

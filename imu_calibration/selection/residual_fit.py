@@ -42,8 +42,7 @@ class BlockFits:
 
     def __init__(self, blocks: RestBlocks, used: Sequence[int], *, prior_sd: np.ndarray, prior_mean: np.ndarray):
         self.blocks, self.used, self._prior = blocks, frozenset(used), (prior_sd, prior_mean)
-        self._white = [blocks.whitener(~blocks.locked), blocks.whitener(blocks.locked)]
-        self._design = [[white(part) / white.scale[axis] for axis, part in enumerate(blocks.design)] for white in self._white]
+        self._design = [[white(part, axis) for axis, part in enumerate(blocks.design)] for white in blocks.white]
         self._at = [np.flatnonzero(np.isin(index, list(used))) for index in blocks.index]
 
     def fit(self, columns: np.ndarray | None = None, *, more: Sequence[int] = (), half: int | None = None) -> BlockFit:
@@ -102,8 +101,8 @@ class BlockFits:
         return excess
 
     def _rows(self, part, axis, at, columns):
-        design, white = self._design[part][axis], self._white[part]
-        further = [] if columns is None else [white(columns[:, :, axis]) / white.scale[axis]]
+        design = self._design[part][axis]
+        further = [] if columns is None else [self.blocks.white[part](columns[:, :, axis], axis)]
         return np.concatenate([design[:, at], *further, design[:, -1:]], axis=1)
 
 

@@ -1,5 +1,6 @@
 """Regimes of a residual: bounds between rows, the permutation test, smooth curves, and which of several regimes is reported."""
 
+import tracemalloc
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,6 +18,14 @@ WINDOW = np.repeat(np.arange(WINDOWS), EACH)
 STARTS = np.arange(len(TIME))
 
 
+def blocks_of(rest, rough, locked=np.zeros(len(TIME), bool)):
+    """Return the blocks of a residual with a bias as the only parameter."""
+    return RestBlocks('gyroscope', SimpleNamespace(rate_s=np.ones((len(TIME), 3))), starts=STARTS, time=TIME, window=WINDOW,
+                      locked=locked, design=tuple(np.stack([np.ones(len(TIME)), column], axis=1) for column in rest.T),
+                      index=tuple(np.zeros((3, 1), int)), variance=np.ones((len(TIME), 3)), processes=(BiasProcess(0.5, 100.0),),
+                      rough=rough, freedom=np.full(len(TIME), 12.0))
+
+
 def found_in(monkeypatch, rest_of_x, rough_of_x=1.0):
     """Return the regimes by time of a residual of unit noise on three axes, with an addition to x, and of the variance within blocks."""
     rng = np.random.default_rng(4)
@@ -24,10 +33,7 @@ def found_in(monkeypatch, rest_of_x, rough_of_x=1.0):
     rest[:, 0] += rest_of_x
     rough = rng.chisquare(12.0, size=rest.shape) / 12.0
     rough[:, 0] *= rough_of_x
-    blocks = RestBlocks('gyroscope', SimpleNamespace(rate_s=np.ones((len(TIME), 3))), starts=STARTS, time=TIME, window=WINDOW,
-                        locked=np.zeros(len(TIME), bool), design=tuple(np.stack([np.ones(len(TIME)), column], axis=1) for column in rest.T),
-                        index=tuple(np.zeros((3, 1), int)), variance=np.ones((len(TIME), 3)), processes=(BiasProcess(0.5, 100.0),),
-                        rough=rough, freedom=np.full(len(TIME), 12.0))
+    blocks = blocks_of(rest, rough)
     monkeypatch.setattr(regimes, 'variables_of', lambda blocks, names: ranged('time', TIME, 's', starts=STARTS))
     attempt = SimpleNamespace(space=SimpleNamespace(prior_sd=np.array([100.0]), prior_mean=np.zeros(1)),
                               recording=SimpleNamespace(kind=np.array(['swing'] * WINDOWS)))
@@ -108,3 +114,17 @@ def test_an_angle_may_begin_beyond_where_it_ends_and_the_ends_of_all_values_are_
 def test_a_block_counts_by_the_share_of_its_rows_inside():
     line, = ranged('time', TIME, 's', starts=STARTS[::4])
     assert line.inside(0.0, 2.0)[:2].tolist() == [0.5, 0.0] and line.marks.sum() == len(TIME) / 4
+
+
+def test_fits_of_all_choices_share_the_factors_of_the_noise():
+    """A factor has the square of the number of blocks; every finding has a fit without it."""
+    blocks = blocks_of(np.random.default_rng(4).normal(size=(len(TIME), 3)), np.ones((len(TIME), 3)), WINDOW % 4 == 0)
+    tracemalloc.start()
+    try:
+        fits = [BlockFits(blocks, used, prior_sd=np.array([100.0]), prior_mean=np.zeros(1)) for used in ((), (0,), (), (0,), (), (0,))]
+        kept = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    square = 8 * sum(int(mask.sum())**2 for mask in (blocks.locked, ~blocks.locked))
+    assert square < kept < 2 * square
+    assert fits[1].fit().excess == BlockFits(blocks, (0,), prior_sd=np.array([100.0]), prior_mean=np.zeros(1)).fit().excess

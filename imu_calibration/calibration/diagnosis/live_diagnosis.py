@@ -77,8 +77,9 @@ class DiagnosisQuestion:
             evidence = self.snapshot.evidence()
             if evidence.found is None:
                 raise too_few_windows(sum(len(spread.windows) for spread in self.snapshot.gathered.spreads))
-            calibrated = None if evidence.demand.changes.lacking else evidence.solution
-            return Answer(describe(told(self.snapshot.table, evidence.found, calibrated=calibrated)), evidence.demand)
+            found, demand, calibrated = evidence.found, evidence.demand, None if evidence.demand.changes.lacking else evidence.solution
+            del evidence   # its columns, of a wider model than those of the session, need much memory
+            return Answer(describe(told(self.snapshot.table, found, calibrated=calibrated)), demand)
         except ImuCalibrationError as error:
             return Answer(DiagnosisState(WAITING, str(error)))
 
