@@ -116,7 +116,7 @@ def choose_held(factor: np.ndarray, priors: np.ndarray, asked: np.ndarray) -> np
         ratio = np.zeros(len(priors))
         # the sds in units of the priors, nearly unlimited without information from the data
         ratio[free] = np.sqrt(np.diag(inverse_gram(np.vstack([factor[:, free] * priors[free],
-                                                              np.eye(np.count_nonzero(free)) / FLAT_PRIOR_FACTOR]))))
+                                                              np.eye(free.sum()) / FLAT_PRIOR_FACTOR]))))
         worst = int(np.argmax(ratio))
         if ratio[worst] <= 0.5:
             break

@@ -188,8 +188,8 @@ class RestrictedLikelihood:
         """
         Return log|V| and the normal matrix of ``[design | residual]`` weighted with V^-1, `information` included.
 
-        For independent variances of the rows, shape (n, n_axes), bias processes and an offset per session; the likelihood is log|V| plus the
-        `profile` of the matrix.
+        For independent variances of the rows, shape (n, n_axes), bias processes and an offset per session.
+        Minus twice the log likelihood is log|V| plus the `profile` of the matrix.
         """
         whitening = Whitening(variance, self._times, self._sessions, processes=processes, session_variance=session_variance)
         white = whitening(self._rows).reshape(-1, self._rows.shape[2])

@@ -132,7 +132,7 @@ def test_halves_that_disagree_make_no_formula(monkeypatch):
     sensor = blocks['gyroscope']
     late = sensor.time > np.median(sensor.time)
     turned = tuple(np.concatenate([part[:, :-1], np.where(late, -1.0, 1.0)[:, None] * part[:, -1:]], axis=1) for part in sensor.design)
-    upset = type(sensor)(**{**sensor.__dict__, 'design': turned})
+    upset = replace(sensor, design=turned)
     told = propose(upset, found.attempt, fits_of(found, upset))
     assert told is None or 'f_z * w' not in str(told.columns)
 

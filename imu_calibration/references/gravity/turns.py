@@ -74,8 +74,8 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
     """
     fresh = np.concatenate([[True], np.any(np.diff(rate, axis=0) != 0, axis=1)])   # a reading published twice is one reading
     ended = np.zeros(len(rate), bool)
-    for signed in (np.abs(rate), *(sign * rate[:, [axis]] for axis in range(3) for sign in (1, -1))):
-        ended |= _at_end(signed, fresh)
+    for signed, axes in ((np.abs, range(3)), *((signed, [axis]) for axis in range(3) for signed in (np.positive, np.negative))):
+        ended |= _at_end(signed(rate[:, axes]), fresh)   # one copy of a long recording at a time
     return ended
 
 
@@ -140,8 +140,8 @@ def _clock_line(number, time, pieces):
 
 def _roughness(time, rate):
     """Return the sum of squared errors of linear interpolation between the two neighbours of each reading."""
-    share = ((time[1:-1] - time[:-2]) / (time[2:] - time[:-2]))[:, None]
-    return float(np.sum((rate[1:-1] - (1 - share) * rate[:-2] - share * rate[2:])**2))
+    share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
+    return float(sum(np.sum((own[1:-1] - (1 - share) * own[:-2] - share * own[2:])**2) for own in rate.T))
 
 
 def rising(time: np.ndarray) -> np.ndarray:
