@@ -38,7 +38,7 @@ def test_each_complaint_has_a_clock_of_its_own(now):
         now[0] = 1000.0 + second
         complaints.now('node', [f'{second} samples lost'] + ['two publishers'] * (second >= 5), ['no disk'] * (5 <= second < 50))
     assert sum('lost' in line for line in heard) == 1 + 129 // int(REMINDER) and sum('two publishers' in line for line in heard) == 3
-    assert [line for line in heard if 'no disk' in line] == ['error: no disk', 'info: over: no disk']
+    assert [line.split(':')[0] for line in heard if line.endswith(': no disk')] == ['error', 'info']
 
 
 def test_what_comes_and_goes_is_not_said_each_time(now):
@@ -86,9 +86,8 @@ def test_the_guide_says_every_change_once(now):
         for _ in range(3):
             now[0] += MIN_ADVICE_SECONDS
             said += guide.lines(state)
-    assert [line for _, line in said] == [
-        'Imu messages are received on /imu from /driver, reliable', 'JointState messages are received on /imu from /driver, reliable',
-        'Imu: stamps are times of arrival, about 8 samples at once; regular times at 200 Hz are drawn through them', 'first window gathered',
-        'unproven; bias: known less well; next: turn about x', 'next: turn about x', 'next: turn about y', 'helps, every parameter is determined; save it with `the command that saves`',
-        'diagnosis: the gyroscopes feel gravity', 'harms; residuals are large']
+    wanted = [('Imu', '/imu', '/driver', 'reliable'), ('JointState', '/imu', '/driver', 'reliable'), ('Imu', ' 8 ', '200 Hz'), ('window',),
+              ('unproven', 'bias: known less well', 'next: turn about x'), ('next: turn about x',), ('next: turn about y',),
+              ('helps', '`the command that saves`'), ('the gyroscopes feel gravity',), ('harms', 'residuals are large')]
+    assert [[value for value in values if value not in line] for (_, line), values in zip(said, wanted, strict=True)] == [[]] * len(wanted), said
     assert said[-1][0] == 'warning'
