@@ -57,8 +57,8 @@ def peak(imu, joints, repetitions):
 
 def test_peak_memory_does_not_grow_with_the_stream(piece, monkeypatch):
     """Three times the length takes no more memory, once all that is kept on purpose is full; nothing of the data is lost by it."""
-    for module, name, value in ((gathering, 'KEPT_POSES', 20), (gathering, 'KEPT_SAMPLES', 2000), (least_squares, 'CAPACITY', 64),
-                                (least_squares, 'MOST_BLOCKS', 4), (least_squares, 'LEAST_ROWS', 4)):
+    for module, name, value in ((gathering, 'KEPT_POSES', 20), (gathering, 'KEPT_SAMPLES', 2000), (least_squares, 'MAX_MEAN_ROWS', 64),
+                                (least_squares, 'MAX_ACCUMULATOR_BLOCKS', 4), (least_squares, 'LEAST_ROWS', 4)):
         monkeypatch.setattr(module, name, value)
     imu, joints = piece
     short, short_peak = peak(imu, joints, 1)
