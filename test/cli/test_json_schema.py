@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from importlib.util import find_spec
 from types import SimpleNamespace
 
 import jsonschema
@@ -69,7 +70,8 @@ def test_quick_verbs(folder, monkeypatch, capsys):
 def test_other_verbs(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     for verb, arguments in LONG.items():
-        document_of([verb, *arguments], capsys)
+        if verb != 'view' or find_spec('foxglove'):   # the extra view is not among the oldest versions
+            document_of([verb, *arguments], capsys)
 
 
 @pytest.mark.real_data
