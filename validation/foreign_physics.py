@@ -7,22 +7,19 @@ Reserved seeds: draw them once, after the search is frozen.
 
 import argparse
 import json
-import os
 import time
 
-for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):   # before numpy: threads that wait for each other use processor time
-    os.environ.setdefault(_name, '1')
-import numpy as np  # noqa: E402
+import numpy as np
 
-from imu_calibration.core.errors import ImuCalibrationError  # noqa: E402
-from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples  # noqa: E402
-from imu_calibration.kinematics.table import Table  # noqa: E402
-from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
-from imu_calibration.use_cases.compensate import compensate  # noqa: E402
-from imu_calibration.use_cases.diagnose import diagnose  # noqa: E402
-from validation import foreign_worlds  # noqa: E402
-from validation.foreign_worlds import PLACED, TABLE, UNPLACED, make_world  # noqa: E402
-from validation.section import markdown_table  # noqa: E402
+from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.kinematics.table import Table
+from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.compensate import compensate
+from imu_calibration.use_cases.diagnose import diagnose
+from validation import foreign_worlds
+from validation.foreign_worlds import PLACED, TABLE, UNPLACED, make_world
+from validation.section import markdown_table
 
 SAME_PLACE = 0.7
 """F1 score of the reported and the true samples from which a place counts as correct."""
