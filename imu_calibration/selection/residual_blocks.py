@@ -83,16 +83,17 @@ class BlockWhitener:
 
     def __init__(self, blocks: RestBlocks, select: np.ndarray):
         variance, time = blocks.variance[select], blocks.time[select]
-        self.scale = np.append(np.sqrt(np.median(variance / variance.mean(axis=1, keepdims=True), axis=0)), 1.0)
+        self.scale = np.sqrt(np.median(variance / variance.mean(axis=1, keepdims=True), axis=0))
         apart = np.abs(time[:, None] - time[None, :])
         covariance = np.diag(variance.mean(axis=1))
         for process in blocks.processes:
             covariance += process.sd**2 * np.exp(-apart / process.time)
         self._factor, self._select = np.linalg.cholesky(covariance), select
 
-    def __call__(self, rows: np.ndarray, axis: int = -1) -> np.ndarray:
-        """Return whitened rows of an axis, shape of the selection; without `axis` they are to be divided by ``scale[axis]``."""
-        return solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False) / self.scale[axis]
+    def __call__(self, rows: np.ndarray, axis: int | None = None) -> np.ndarray:
+        """Return whitened rows of an axis, shape of the selection; of all axes, still to be divided by ``scale[axis]``, without `axis`."""
+        white = solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False)
+        return white if axis is None else white / self.scale[axis]
 
 
 def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, explained: ExplainedWindows) -> dict[str, RestBlocks]:
