@@ -32,30 +32,33 @@ def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: J
         Lags -> (weight, shifted motion) pairs of earlier calls with this motion; new ones are added.
 
     """
-    lags: list[Any] = [roughly]
-    delays, changes = [(1.0, np.zeros(()))], []
+    acting = []
     for effect in model.concerning(sensor):
-        if effect.warp is None:
-            continue
         at = (values or {}).get(effect.name)
         at = model.point_of(effect) if at is None else np.atleast_1d(at)
-        if not np.any(at):
-            continue
-        if not isinstance(effect.warp, Lag):
-            changes.append((effect.warp, at))
-            continue
-        lag = effect.warp.single if roughly else effect.warp
-        lags += [effect.name, *at]
-        delays = [(weight * w, delay + d) for weight, delay in delays for w, d in lag.delays(motion.time, at)]
-    known, key, references = {} if shifts is None else shifts, tuple(lags), []
+        if effect.warp is not None and np.any(at):
+            acting.append((effect, at))
+    lags = [(effect, at) for effect, at in acting if isinstance(effect.warp, Lag)]
+    key, known = (roughly, *((effect.name, *at) for effect, at in lags)), {} if shifts is None else shifts
     if key not in known:
-        known[key] = [(weight, shifted(motion, delay)) for weight, delay in delays]
+        known[key] = _shifted_by(lags, motion, roughly)
+    references = []
     for weight, felt in known[key]:
         there = table
-        for warp, at in changes:
-            there, felt = warp(there, felt, at)
+        for effect, at in acting:
+            if not isinstance(effect.warp, Lag):
+                there, felt = effect.warp(there, felt, at)
         references.append((weight, reference_motion(there, felt, temperature_c)))
     return mean_reference(references, motion)
+
+
+def _shifted_by(lags, motion, roughly):
+    """Return (weight, motion) pairs: the motion at each sum of the delays of (effect, value) pairs."""
+    delays = [(1.0, np.zeros(()))]
+    for effect, at in lags:
+        lag = effect.warp.single if roughly else effect.warp
+        delays = [(weight * w, delay + d) for weight, delay in delays for w, d in lag.delays(motion.time, at)]
+    return [(weight, shifted(motion, delay)) for weight, delay in delays]
 
 
 def mean_reference(weighted: Sequence[tuple[float, Reference]], motion: JointMotion) -> Reference:
