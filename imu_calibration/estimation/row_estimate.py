@@ -160,8 +160,7 @@ def _of_scatter(rows, scatter, free):
     variance = scatter.total(rows.noise, rows.component, inflated=True)
     design = np.hstack([rows.nuisance, rows.main[:, free]]) / np.sqrt(variance)[:, None]
     factor = triangular_of_band(design)
-    orthogonal = scipy.linalg.solve_triangular(factor, design.T, trans='T')
-    gain = scipy.linalg.solve_triangular(factor, orthogonal)[rows.nuisance.shape[1]:] * np.sqrt(1 - rows.noise / variance)
+    gain = scipy.linalg.cho_solve((factor, False), design.T)[rows.nuisance.shape[1]:] * np.sqrt(1 - rows.noise / variance)
     found = np.zeros((len(free),) * 2)
     found[np.ix_(free, free)] = gain @ gain.T
     return found

@@ -42,7 +42,7 @@ def triangular_of_band(rows: np.ndarray) -> np.ndarray:
     for number in range(-(-len(factor) // BAND_COLUMNS)):
         own = np.concatenate([carried, rows[band == number]])
         used = np.flatnonzero(own.any(axis=0))
-        part, done = np.linalg.qr(own[:, used], mode='r'), np.searchsorted(used, (number + 1) * BAND_COLUMNS)
+        part, done = triangular(own[:, used]), np.searchsorted(used, (number + 1) * BAND_COLUMNS)
         carried = np.zeros((len(part), len(factor)))
         carried[:, used] = part
         factor[used[:len(part[:done])]], carried = carried[:done], carried[done:]
