@@ -1,8 +1,8 @@
 """
 Processor time and peak memory of the verbs, relative to a bare iteration of rosbags over the same bag.
 
-The limits were stated in seconds on one machine, where `calibrate` of an hour at 1 kHz took 19.4 s of processor time, 2.7 times a bare
-iteration over the raw messages of its sqlite3 bag. One iteration therefore took 7.2 s, 1.67 us per message: a limit of S seconds for a
+The limits were stated in seconds on one machine, where `calibrate` of an hour at 1 kHz needed 19.4 s of processor time, 2.7 times a bare
+iteration over the raw messages of its sqlite3 bag. One iteration therefore needed 7.2 s, 1.67 us per message: a limit of S seconds for a
 bag of N messages is S / (1.67e-6 N) iterations. The iteration and the verb run one after the other, and the ratio is the median over
 the repetitions, so that a slow or busy machine changes both. The processor time of a verb includes its imports and its report.
 Run it separately with ``python benchmarks/bench_verbs.py [--repetitions N] [--only TEXT]``.
@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
-    sys.path[:0] = [str(ROOT), str(ROOT / 'test')]   # simulated worlds are those of the tests
+    sys.path[:0] = [str(ROOT), str(ROOT / 'test')]   # simulated worlds of the tests
 
 from benchmarks.bags import hand_session, iterate, long_session, run_verb, write_bench_bag  # noqa: E402
 from imu_calibration.use_cases.resources import config_file  # noqa: E402
@@ -68,11 +68,11 @@ CASES = (
 def bench_verbs(repetitions=REPETITIONS, only=''):
     """Yield (case, multiples of a bare iteration, seconds, MB, limit as multiple); multiples, seconds and MB of each repetition."""
     with TemporaryDirectory() as folder:
-        for name, session in SESSIONS.items():
+        for number, (name, session) in enumerate(SESSIONS.items()):
             cases = [case for case in CASES if case.session == name and only in f'{case.verb} {name}']
             if not cases:
                 continue
-            bag = write_bench_bag(Path(folder, f'bag{list(SESSIONS).index(name)}'), session=session.make())
+            bag = write_bench_bag(Path(folder, f'bag{number}'), session=session.make())
             limit = 1 / (SECONDS_PER_MESSAGE * session.messages)
             for case in cases:
                 runs = [_measure(case, bag, Path(folder, f'{case.verb}_{k}')) for k in range(repetitions)]
@@ -81,11 +81,11 @@ def bench_verbs(repetitions=REPETITIONS, only=''):
 
 def _measure(case, bag, output):
     """Return (processor seconds of a bare iteration, processor seconds of the verb, its peak MB)."""
-    iteration = iterate(bag)
+    iteration, table = iterate(bag), config_file('table_simulated.yaml')
     calibration = bag.parent / f'calibration_{bag.name}'
     if case.verb == 'compensate' and not calibration.exists():
-        run_verb(_command('calibrate', bag, '--table', str(config_file('table_simulated.yaml')), '--output', str(calibration), '--no-report'))
-    paths = {'TABLE': config_file('table_simulated.yaml'), 'OUTPUT': output, 'CALIBRATION': calibration / 'calibration.yaml'}
+        run_verb(_command('calibrate', bag, '--table', str(table), '--output', str(calibration), '--no-report'))
+    paths = {'TABLE': table, 'OUTPUT': output, 'CALIBRATION': calibration / 'calibration.yaml'}
     seconds, memory = run_verb(_command(case.verb, bag, *(str(paths.get(each, each)) for each in case.arguments)))
     return iteration, seconds, memory
 
@@ -98,7 +98,7 @@ def main():
     """Print a line per case; exit code 1 when a limit is passed."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--repetitions', type=int, default=REPETITIONS)
-    parser.add_argument('--only', default='', help='run the cases whose name contains this text')
+    parser.add_argument('--only', default='', help='run the cases with this text in the name')
     options = parser.parse_args()
     missed = False
     for case, multiples, seconds, memory, limit in bench_verbs(options.repetitions, options.only):

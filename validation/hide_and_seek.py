@@ -9,7 +9,6 @@ come, so that ``--from-record`` counts what there is of a run that was stopped, 
 
 import argparse
 import json
-import os
 import signal
 import sys
 import time

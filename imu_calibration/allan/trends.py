@@ -98,9 +98,9 @@ class TrendSearch:
         self._lag = lag
         centred = self._walk - self._walk.mean(axis=0) - self._walk.mean(axis=1)[:, None] + self._walk.mean()
         self._scale = float(np.trace(centred)) / len(lag)
-        # Unit white noise and a random walk for each ratio, in a form that needs no variance of the walk.
-        centred = self._walk - self._walk[:1] - self._walk[:, :1] + self._walk[0, 0]
-        factors = np.linalg.cholesky(np.eye(len(lag)) + WALK_VARIANCE_RATIOS[:, None, None] / self._scale * centred)
+        # Unit white noise and, for each ratio, the change of a random walk since the first block.
+        change = self._walk - self._walk[:1] - self._walk[:, :1] + self._walk[0, 0]
+        factors = np.linalg.cholesky(np.eye(len(lag)) + WALK_VARIANCE_RATIOS[:, None, None] / self._scale * change)
         self._inverses, self._logs = np.linalg.inv(factors), _log_determinants(factors)
 
     @property

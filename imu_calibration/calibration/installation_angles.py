@@ -110,7 +110,7 @@ def _between_sd(axes, tangent, covariance, i, j):
 def in_paper_units(derived: Derived,
                    nominal: NominalScaling | Mapping | None = None) -> tuple[tuple[str, str, np.ndarray, np.ndarray], ...]:
     """
-    Return scale factors and biases in the units of the source papers, as (what, unit, values (3,), sds (3,)).
+    Return scale factors and biases in the units of the source papers, as (quantity, unit, values (3,), sds (3,)).
 
     Accelerometers: V/g and V for a recording in volts (`nominal` given), else g/g and mg. Gyroscopes: V/(deg/s) and V, else the
     plain ratio and deg/s.

@@ -37,27 +37,27 @@ def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: J
         at = (values or {}).get(effect.name)
         at = model.point_of(effect) if at is None else np.atleast_1d(at)
         if effect.warp is not None and np.any(at):
-            acting.append((effect, at))
-    lags = [(effect, at) for effect, at in acting if isinstance(effect.warp, Lag)]
-    key, known = (roughly, *((effect.name, *at) for effect, at in lags)), {} if shifts is None else shifts
+            acting.append((effect.name, effect.warp, at))
+    lags = [(name, warp, at) for name, warp, at in acting if isinstance(warp, Lag)]
+    key, known = (roughly, *((name, *at) for name, _, at in lags)), {} if shifts is None else shifts
     if key not in known:
         known[key] = _shifted_by(lags, motion, roughly)
     references = []
     for weight, felt in known[key]:
         there = table
-        for effect, at in acting:
-            if not isinstance(effect.warp, Lag):
-                there, felt = effect.warp(there, felt, at)
+        for _, warp, at in acting:
+            if not isinstance(warp, Lag):
+                there, felt = warp(there, felt, at)
         references.append((weight, reference_motion(there, felt, temperature_c)))
     return mean_reference(references, motion)
 
 
 def _shifted_by(lags, motion, roughly):
-    """Return (weight, motion) pairs: the motion at each sum of the delays of (effect, value) pairs."""
+    """Return (weight, motion) pairs: the motion at each sum of the delays of (name, Lag, values) triples."""
     delays = [(1.0, np.zeros(()))]
-    for effect, at in lags:
-        lag = effect.warp.single if roughly else effect.warp
-        delays = [(weight * w, delay + d) for weight, delay in delays for w, d in lag.delays(motion.time, at)]
+    for _, lag, at in lags:
+        some = (lag.single if roughly else lag).delays(motion.time, at)
+        delays = [(weight * w, delay + d) for weight, delay in delays for w, d in some]
     return [(weight, shifted(motion, delay)) for weight, delay in delays]
 
 

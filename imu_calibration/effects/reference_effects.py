@@ -33,7 +33,7 @@ def _second_order():
 
 
 SECOND_ORDER = _second_order()
-_LAG_COLUMNS = {
+_LAG_FORMS = {
     'bandwidth': ('time_constant', FIRST_ORDER, 'has a first-order low-pass filter: '
                   'its output has a lag and a smaller amplitude at high frequency'),
     'delay': ('delay', ((1.0, 1.0),), 'sends its output late, and the other sensor does not: a pure delay of its own'),
@@ -44,7 +44,7 @@ _LAG_COLUMNS = {
 
 
 def _lag_effect(sensor, ending):
-    component, pairs, does = _LAG_COLUMNS[ending]
+    component, pairs, does = _LAG_FORMS[ending]
     return Effect(
         name=lag_name(sensor, ending), sensor=sensor, components=(component,), shape=(), unit='s', nonnegative=True, in_reference=True,
         explanation=f'The {sensor} {does}.', tolerance=1e-4, prior_sd=0.1, plausible=(('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),),
@@ -58,7 +58,7 @@ def lag_name(sensor: str, ending: str) -> str:
     return f'{PREFIXES[sensor]}_{ending}'
 
 
-LAGS = tuple(_lag_effect(sensor, ending) for ending in _LAG_COLUMNS for sensor in SENSORS)
+LAGS = tuple(_lag_effect(sensor, ending) for ending in _LAG_FORMS for sensor in SENSORS)
 """
 First-order filter, pure delay and second-order filter of each sensor; collinear where small, separable where large.
 """
