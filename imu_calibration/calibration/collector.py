@@ -24,7 +24,7 @@ from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.stream_cleaning import Watcher
-from imu_calibration.preprocessing.window import Window, WindowSettings
+from imu_calibration.preprocessing.window import StoredWindows, Window, WindowSettings
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.gathered import (
@@ -211,8 +211,8 @@ class Collector:
     """Feeds blocks to the window finder and reduces its windows; the same object serves bags and live topics."""
 
     def __init__(self, table: Table, model: SensorModel, settings: WindowSettings = WindowSettings(), *,
-                 nominal: NominalScaling | None = None, session: int = 0, watchers: Sequence[Watcher] = (), windows: list | None = None,
-                 spread: bool = False, judged_from: float = 0.0):
+                 nominal: NominalScaling | None = None, session: int = 0, watchers: Sequence[Watcher] = (),
+                 windows: list | StoredWindows | None = None, spread: bool = False, judged_from: float = 0.0):
         self.table, self.model, self.session, self.windows, self.spread = table, model, session, windows, spread
         self.gatherer = MotionGatherer(table, settings, windows is not None, nominal=nominal, watchers=watchers)
         self.gathered = Gathered(judged_from=judged_from)
@@ -252,7 +252,7 @@ class Collector:
 
     def _take(self, windows):
         if self.windows is not None:
-            self.windows += windows
+            self.windows.extend(windows)
         return [self._reduce(window) for window in windows if window.kind != 'unused']
 
     def _reduce(self, window):
@@ -305,7 +305,8 @@ class GatherStep:
         session, source = numbered
         return naming(self.names, session)(self.read, source(), session, Preflight(self.table.gravity_value))
 
-    def read(self, blocks: Iterable[SampleBlock], session: int, preflight: Preflight, *, windows: list | None = None) -> Gathered:
+    def read(self, blocks: Iterable[SampleBlock], session: int, preflight: Preflight, *,
+             windows: list | StoredWindows | None = None) -> Gathered:
         """
         Return the Gathered of a recording, which is read once, for its windows and for the checks.
 

@@ -1,8 +1,12 @@
 """Windows, their construction from samples, and the settings of the segmentation."""
 
-from collections.abc import Iterator, Sequence
+import pickle
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from io import SEEK_END
+from tempfile import SpooledTemporaryFile
+from typing import Any
 
 import numpy as np
 
@@ -125,11 +129,39 @@ def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason =
                   samples.joint_step.max(axis=0), samples.corrected)
 
 
+STORED_IN_MEMORY = 64 << 20
+"""Bytes of `StoredWindows` in memory; more are moved to a temporary file."""
+
+
+class StoredWindows:
+    """A list of windows in a temporary file, so that memory does not grow with the recording; an access reads a window from the file."""
+
+    def __init__(self) -> None:
+        self._file: Any = SpooledTemporaryFile(max_size=STORED_IN_MEMORY)
+        self._starts: list[int] = []
+
+    def __del__(self) -> None:
+        self._file.close()
+
+    def __len__(self) -> int:
+        return len(self._starts)
+
+    def __getitem__(self, number: int) -> Window:
+        self._file.seek(self._starts[number])
+        return pickle.load(self._file)
+
+    def extend(self, windows: Iterable[Window]) -> None:
+        """Append windows."""
+        for window in windows:
+            self._starts.append(self._file.seek(0, SEEK_END))
+            pickle.dump(window, self._file, pickle.HIGHEST_PROTOCOL)
+
+
 WINDOW_GROUP_SAMPLES = 4096
 """Samples whose columns or predictions are in memory at once."""
 
 
-def chunks(windows: Sequence[Window]) -> Iterator[list[Window]]:
+def chunks(windows: Iterable[Window]) -> Iterator[list[Window]]:
     """Yield the windows in groups of at most `WINDOW_GROUP_SAMPLES` samples, or of a single longer window, in order."""
     part, size = [], 0
     for window in windows:

@@ -15,7 +15,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.spike_filter import SPIKE_REACH
 from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT
-from imu_calibration.preprocessing.window import WINDOW_GROUP_SAMPLES, WindowSettings, chunks
+from imu_calibration.preprocessing.window import WINDOW_GROUP_SAMPLES, StoredWindows, WindowSettings, chunks
 from imu_calibration.preprocessing.window_cutter import MIN_MOVING_SECONDS, WanderLimit
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
@@ -527,3 +527,16 @@ def test_columns_of_a_chunk_need_the_memory_of_one_chunk():
     groups = [[len(window.motion) for window in group] for group in chunks([SimpleNamespace(motion=range(size)) for size in sizes])]
     assert groups == [[WINDOW_GROUP_SAMPLES - 1], [WINDOW_GROUP_SAMPLES - 1, 1], [1], [3 * WINDOW_GROUP_SAMPLES], [5]]
     assert list(chunks([])) == []
+
+
+def test_stored_windows_are_the_windows():
+    """In order, in turn and out of turn, while more are appended, and in a file instead of memory."""
+    windows, _ = gather(*record(rest(5)))
+    windows, stored = [*windows, *gather(*record(rest(3), seed=1))[0]], StoredWindows()
+    for window in windows:
+        stored.extend([window])
+        same(stored[0], windows[0])
+    stored._file.rollover()
+    stored.extend(windows[:1])
+    for found, window in zip(stored, [*windows, windows[0]], strict=True):
+        same(found, window)

@@ -23,6 +23,7 @@ from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.window import StoredWindows
 from imu_calibration.references.gravity.model_selection import too_few_poses
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.selection.investigation import too_few_windows
@@ -104,7 +105,7 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
     DiagnosisResult
 
     """
-    windows = []
+    windows = StoredWindows()
 
     def read(step, numbered):
         return [step.read(source(), session, Preflight(table.gravity_value), windows=windows if not windows else None) for session,

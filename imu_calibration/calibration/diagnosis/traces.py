@@ -12,7 +12,7 @@ from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.strapdown import drift_over
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window, all_samples, chunks
+from imu_calibration.preprocessing.window import StoredWindows, Window, all_samples, chunks
 from imu_calibration.selection.gain import MEASURES, OF_MODEL, Gain, reduction_interval
 from imu_calibration.selection.residual_blocks import residuals
 from imu_calibration.selection.saturation import measured
@@ -191,7 +191,7 @@ class Traces:
     """Sensor -> residual power by band; empty by hand."""
 
 
-def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *, after: Solution | Calibration) -> Traces:
+def residual_traces(windows: Sequence[Window] | StoredWindows, table: Table, before: Solution, *, after: Solution | Calibration) -> Traces:
     """
     Return the Traces of two models on a recording.
 
@@ -209,8 +209,8 @@ def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *
 
     """
     models = before, after
-    sums, parts, counts, warmth = DistanceSums(), [], [], []
-    for group in chunks([window for window in windows if window.kind != 'unused']):
+    sums, parts, counts, warmth, spans = DistanceSums(), [], [], [], []
+    for group in chunks(_used(windows, spans)):
         rest, against = [residuals(group, table, each.model, values=each.values) for each in models], _variables(group, table, before)
         ends = np.cumsum([len(window) for window in group])
         for window, stop in zip(group, ends):
@@ -225,10 +225,19 @@ def residual_traces(windows: Sequence[Window], table: Table, before: Solution, *
     temperature = np.concatenate(known) if len(known) == len(warmth) else None
     time, position, force_s, rate_s, *errors = (np.concatenate(column) for column in zip(*parts))
     old, new = (dict(zip(SENSORS, errors[k:k + 2])) for k in (0, 2))
-    segments = {sensor: [_segment(windows, table, models, sensor, axis, *_largest(time, old[sensor][:, axis])) for axis in range(3)]
+    segments = {sensor: [_segment(windows, spans, table, models, sensor, axis, *_largest(time, old[sensor][:, axis])) for axis in range(3)]
                 for sensor in SENSORS}
     return Traces(time, np.concatenate([kind for _, kind in counts]), position, force_s, rate_s, temperature, old, new,
-                  np.concatenate([number for number, _ in counts]), _dead_reckoning(windows, table, models), segments, sums.distances())
+                  np.concatenate([number for number, _ in counts]), _dead_reckoning(windows, spans, table, models), segments,
+                  sums.distances())
+
+
+def _used(windows, spans):
+    """Yield the windows that are not unused, and append (first, last) time of every window to `spans`."""
+    for window in windows:
+        spans.append((window.time[0], window.time[-1]))
+        if window.kind != 'unused':
+            yield window
 
 
 def _largest(time, residual):
@@ -239,8 +248,8 @@ def _largest(time, residual):
     return time[first] - PLOT_BLOCK_SECONDS, time[first] + SEGMENT
 
 
-def _segment(windows, table, models, sensor, axis, start, stop):
-    inside = [window for window in windows if window.time[-1] >= start and window.time[0] <= stop]
+def _segment(windows, spans, table, models, sensor, axis, start, stop):
+    inside = [windows[k] for k, (first, last) in enumerate(spans) if last >= start and first <= stop]
     time = np.concatenate([window.time for window in inside])
     found = {'measured': np.concatenate([measured(window, sensor)[:, axis] for window in inside])}
     for name, model in zip(('simulated before', 'simulated after'), models):
@@ -278,20 +287,20 @@ def _block_mean(values, block, number):
     return means[:, 0] if values.ndim == 1 else means
 
 
-def _dead_reckoning(windows, table, models):
+def _dead_reckoning(windows, spans, table, models):
     """Return medians over stretches of 50 s without gaps, or None."""
     stretches, run = [], []
-    for window in windows:
-        if run and not 0 < window.time[0] - run[-1].time[-1] <= MAX_STRETCH_STEP:
+    for number, (first, last) in enumerate(spans):
+        if run and not 0 < first - spans[run[-1]][1] <= MAX_STRETCH_STEP:
             run = []
-        run.append(window)
-        if window.time[-1] - run[0].time[0] > DEAD_RECKONING:
+        run.append(number)
+        if last - spans[run[0]][0] > DEAD_RECKONING:
             stretches.append(run)
             run = []
     if not stretches:
         return None
     chosen = [stretches[k] for k in np.unique(np.linspace(0, len(stretches) - 1, MOST_STRETCHES).round().astype(int))]
-    drifts = [_drifts(stretch, table, models) for stretch in chosen]
+    drifts = [_drifts([windows[k] for k in stretch], table, models) for stretch in chosen]
     velocity, position = (np.median([[getattr(drift, name)[0] for drift in pair] for pair in drifts], axis=0) for name in
                           ('velocity', 'position'))
     return {'seconds': DEAD_RECKONING, 'position_before': float(position[0]), 'position_after': float(position[1]),
