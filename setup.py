@@ -65,7 +65,7 @@ setup(
     cmdclass={'install_scripts': InstallScripts, 'develop': Develop},
     entry_points={
         'console_scripts': [
-            f'{NAME} = {NAME}.cli.main:main',
+            f'{NAME} = {NAME}.__main__:main',
             *(f'{node} = {NAME}.nodes.{node}:main' for node in NODES),
         ],
         'ros2cli.command': [f'imu = {NAME}.cli.ros2:ImuCommand'],

@@ -64,8 +64,7 @@ From the lowest layer; each package imports only packages above it in this list.
 ================  ======================================================================================================
 """
 
-from typing import TYPE_CHECKING
-
+TYPE_CHECKING = False   # the name that type checkers take for true; `typing` would take most of the time of this import
 if TYPE_CHECKING:
     from imu_calibration.use_cases.notebook import calibrate, check, compensate, diagnose, load, simulate
 

@@ -1,6 +1,56 @@
-"""``python -m imu_calibration VERB``."""
+"""Entry of the command line, also as ``python -m imu_calibration VERB``; an interruption ends it with 130 from here on."""
 
-from imu_calibration.cli.main import main
+import signal
+import sys
+from types import FrameType
+
+NUMERICAL = ('numpy', 'scipy')
+RETRY_SECONDS, MOST_RETRIES = 0.02, 100
+"""A postponed interruption is tried again after this time; in numerical packages at most so often."""
+
+
+class Interruption:
+    """
+    Handler of signals: raises KeyboardInterrupt as soon as the running code does not swallow it.
+
+    It is postponed within an import, where numpy reports a broken installation, and at first within numpy and scipy, where finalizers
+    and compiled functions print the exception and continue.
+    """
+
+    def __init__(self) -> None:
+        self._left = MOST_RETRIES
+
+    def __call__(self, _number: int, frame: FrameType | None) -> None:
+        """Raise now or later."""
+        importing = numerical = False
+        while frame is not None:
+            importing |= frame.f_code.co_filename.startswith('<frozen importlib')
+            numerical |= frame.f_globals.get('__name__', '').partition('.')[0] in NUMERICAL
+            frame = frame.f_back
+        self._left -= numerical
+        if importing or (numerical and self._left >= 0):
+            signal.setitimer(signal.ITIMER_REAL, RETRY_SECONDS)
+        else:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)   # a second one ends the process at once, without a traceback
+            raise KeyboardInterrupt
+
+
+def main() -> int:
+    """Run the command line; return its exit code. Partial results are removed after SIGTERM as after Ctrl+C."""
+    handler = Interruption()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
+        if signal.getsignal(number) != signal.SIG_IGN:   # a background job ignores SIGINT
+            signal.signal(number, handler)
+    try:
+        from imu_calibration.cli.main import main as run_verb
+        code = run_verb()
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        return code
+    except KeyboardInterrupt:
+        print('imu_calibration: interrupted; no file was written', file=sys.stderr)
+        return 130
+
 
 if __name__ == '__main__':
     raise SystemExit(main())

@@ -57,7 +57,7 @@ def files(root):
     """Return the product's Python files and the pages."""
     if root.is_file():
         return [root]
-    skip = {'test', 'build', 'install', 'validation', 'tools'}
+    skip = {'test', 'build', 'install', 'validation', 'tools', 'site', 'demo'}
     found = [path for pattern in ('*.py', '*.html') for path in root.rglob(pattern)
              if not any(part in skip or part.startswith('.') for part in path.relative_to(root).parts)]
     found += [p for p in [root / 'README.md', root / 'CONTRIBUTING.md'] if p.exists()]

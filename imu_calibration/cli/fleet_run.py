@@ -90,19 +90,19 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
     choices = choices_of(options)
     used = provenance_with('fleet', (), choices, stand=stand_of(options))['options']
     units = [unit_of(name, paths, topics_of(choices), joint_names=table.joint_names, options=used) for name, paths in found]
-    folder = files.make_folder(options.output)
-    advance = counter('units', len(units))
-    mapper = _mapper(options, len(units), lambda result: advance(1))
-    results = mapper(FleetStep(table, settings, None if options.no_report else calibration_report), units)
-    spreads = summarise(results)
-    for result in results:
-        for name, text in (result.files or {}).items():
-            files.write_text(files.make_folder(folder / result.name) / name, text)
-    rows = {'summary.csv': parameter_rows(spreads), 'units.csv': unit_rows(results)}
-    for name, table in rows.items():
-        files.write_text(folder / name, csv_text(table))
-    files.write_text(folder / 'summary.html', summary_html(results, spreads))
-    show_fleet(results, spreads, folder, hints=hints_of(options))
+    with files.output_folder(options.output) as folder:
+        advance = counter('units', len(units))
+        mapper = _mapper(options, len(units), lambda result: advance(1))
+        results = mapper(FleetStep(table, settings, None if options.no_report else calibration_report), units)
+        spreads = summarise(results)
+        for result in results:
+            for name, text in (result.files or {}).items():
+                files.write_text(files.make_folder(folder / result.name) / name, text)
+        rows = {'summary.csv': parameter_rows(spreads), 'units.csv': unit_rows(results)}
+        for name, table in rows.items():
+            files.write_text(folder / name, csv_text(table))
+        files.write_text(folder / 'summary.html', summary_html(results, spreads))
+        show_fleet(results, spreads, folder, hints=hints_of(options))
     return VerbResult(fleet_exit_code(results), {'units': rows['units.csv'], 'parameters': rows['summary.csv']})
 
 

@@ -4,13 +4,12 @@ import contextlib
 import io
 import json
 import os
-import signal
 import sys
 import threading
 import time
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TextIO
 
 SHARE_BAR, RUNNING_BAR = '{desc} {percentage:3.0f}% |{bar:40}| {elapsed}', '{desc} |{bar:40}| {elapsed}'
 """Lines of progress with a known and an unknown total."""
@@ -19,36 +18,47 @@ SWEEP, SWEEP_STEP_SECONDS = 10, 0.2
 
 
 class ProgressBars:
-    """Listens to `imu_calibration.core.progress`: the bar of the present phase, removed at the end; it moves between reports too."""
+    """Listens to `imu_calibration.core.progress`: the bar of the present phase, removed before other text; it moves between reports too."""
 
     def __init__(self, *, verbose: bool = False):
         self._verbose, self._ended = verbose, threading.Event()
         self._bar: Any = None
-        self._phase, self._since = '', time.monotonic()
+        self._phase, self._since, self._removed = '', time.monotonic(), False
 
     def __enter__(self):
+        self._streams = sys.stdout, sys.stderr
+        sys.stdout, sys.stderr = (OtherText(stream, self) for stream in self._streams)
         return self
 
     def __exit__(self, *exception):
         self._change('')
         self._ended.set()
+        sys.stdout, sys.stderr = self._streams
         if self._bar is not None:
             self._refresher.join()
             self._bar.close()
+
+    def remove(self) -> None:
+        """Remove the bar until the next report."""
+        if self._bar is not None and not self._removed:
+            with self._bar.get_lock():
+                self._removed = True
+                self._bar.clear(nolock=True)
 
     def __call__(self, phase: str, done: float, total: float) -> None:
         """Show the amount done of a phase."""
         new = phase != self._phase
         if new:
             self._change(phase)
-        if not sys.stderr.isatty():
+        if not self._streams[1].isatty():
             return
         if self._bar is None:
             from tqdm import tqdm
-            self._bar = tqdm(total=SWEEP, bar_format=RUNNING_BAR, leave=False, dynamic_ncols=True)
+            self._bar = tqdm(total=SWEEP, bar_format=RUNNING_BAR, leave=False, dynamic_ncols=True, file=self._streams[1])
             self._refresher = threading.Thread(target=self._refresh, name='progress', daemon=True)
             self._refresher.start()
         self._bar.total, self._bar.bar_format = total or SWEEP, SHARE_BAR if total else RUNNING_BAR
+        self._removed = False
         if new:
             self._bar.set_description_str(phase, refresh=False)
             self._bar.reset()
@@ -59,12 +69,29 @@ class ProgressBars:
         while not self._ended.wait(SWEEP_STEP_SECONDS):
             if self._bar.bar_format == RUNNING_BAR:
                 self._bar.n = (self._bar.n + 1) % (SWEEP + 1)
-            self._bar.refresh()
+            with self._bar.get_lock():
+                if not self._removed:
+                    self._bar.refresh(nolock=True)
 
     def _change(self, phase):
         if self._verbose and self._phase:
             print(f'{self._phase}: {time.monotonic() - self._since:.1f} s', file=sys.stderr)
         self._phase, self._since = phase, time.monotonic()
+
+
+class OtherText:
+    """A stream that removes the bar before it writes."""
+
+    def __init__(self, stream: TextIO, bars: ProgressBars):
+        self._stream, self._bars = stream, bars
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write below nothing else."""
+        self._bars.remove()
+        return self._stream.write(text)
 
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -74,8 +101,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; return the exit code (see `parser.EXIT_CODES`)."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    with contextlib.suppress(ValueError):   # only in the main thread: partial results are then removed as after Ctrl+C
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         from imu_calibration.cli.parser import make_parser
         options = make_parser(*arguments[:1]).parse_args(arguments)
@@ -86,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: Namespace) -> int:
     """Run the verb that was parsed and print its document if --json is given; return the exit code."""
-    from imu_calibration.cli.parser import hints_of
+    from imu_calibration.cli.parser import complain, hints_of
     from imu_calibration.core.errors import ImuCalibrationError, printable
     from imu_calibration.core.progress import listening
     prog = f'imu_calibration {options.verb}'
@@ -105,7 +130,7 @@ def run(options: Namespace) -> int:
             text, key, name = error.told(hints_of(options)), error.key, error.code
         else:
             text, key, name = printable(f'{type(error).__name__}: {error}; check disk space, memory, permissions and the input'), None, ''
-        print(f'{prog}: {text}', file=sys.stderr)
+        complain(f'{prog}: {text}')
         code, document = 1, {'error': text, 'key': key, 'code': name}
     except KeyboardInterrupt:
         return _interrupted(prog)

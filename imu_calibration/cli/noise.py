@@ -1,11 +1,10 @@
 """``imu_calibration noise``: the noise of an IMU from a recording at rest."""
 
-import sys
 from argparse import Namespace
 from itertools import groupby
 
 from imu_calibration.cli.arguments import add_topic_arguments
-from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
+from imu_calibration.cli.parser import OneLineParser, VerbResult, complain, folded
 
 EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
 
@@ -17,7 +16,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--output', metavar='DIR', required=True, help='folder for noise.yaml and report.html')
     common('--rate', metavar='HZ', type=float, action='append', default=[],
            help='also print the discrete figures for this sampling rate; may be repeated')
-    expert('--horizon', metavar='S', type=float, 
+    expert('--horizon', metavar='S', type=float,
            help='averaging time at which a random walk replaces other slow noise, default 100 s')
     expert('--nominal', metavar='FILE', help='YAML with offsets and scales for recordings in volts or counts')
     common('--no-report', action='store_true', help='write noise.yaml only')
@@ -34,7 +33,7 @@ def run(options: Namespace) -> VerbResult:
         found = noise(options.bag, imu_topic=options.imu_topic, temperature_topic=options.temperature_topic, frame_id=options.frame_id,
                       nominal=options.nominal, **chosen)
         for warning in found.warnings:
-            print(f'warning: {warning}', file=sys.stderr)
+            complain(f'warning: {warning}')
         found.save(folder, report=not options.no_report)
         _show(found, [found.figures.rate, *options.rate], folder, 'noise.yaml' + ('' if options.no_report else ' and report.html'))
         return VerbResult(found.exit_code, to_mapping(found.figures, found.horizon))

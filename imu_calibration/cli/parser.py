@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from shutil import get_terminal_size
 from textwrap import wrap
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, TextIO
 
 import imu_calibration
 from imu_calibration.core.errors import ERROR_KEYS, did_you_mean
@@ -60,18 +60,24 @@ class OneLineParser(argparse.ArgumentParser):
         options, extra = self.parse_known_args(args, namespace)
         if extra:
             known = getattr(options, 'verb_options', ())
+            self.prog += f' {options.verb}'
             self.error(f'unrecognized arguments: {" ".join(extra)}{did_you_mean(extra[0].partition("=")[0], known)}')
         return options
 
     def error(self, message: str) -> NoReturn:
         """Print the requirement and stop."""
-        print(f"{self.prog}: {message}; see '{self.prog} --help'", file=sys.stderr)
+        complain(f"{self.prog}: {message}; see '{self.prog} --help'")
         raise SystemExit(1)
 
 
-def folded(text: str, indent: str = '', last: str = '') -> str:
-    """Return a line for standard output, broken between words at the width of a terminal; `last` ends each but the last part."""
-    if not sys.stdout.isatty():
+def complain(text: str) -> None:
+    """Print a line on standard error."""
+    print(folded(text, stream=sys.stderr), file=sys.stderr)
+
+
+def folded(text: str, indent: str = '', last: str = '', stream: TextIO | None = None) -> str:
+    """Return a line for `stream` (standard output), broken between words at the width of a terminal; `last` ends each but the last part."""
+    if not (stream or sys.stdout).isatty():
         return text
     width = get_terminal_size().columns - len(last)
     return f'{last}\n'.join(wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False))
@@ -89,8 +95,8 @@ def make_parser(verb: str | None = None) -> OneLineParser:
 def add_verbs(parser: argparse.ArgumentParser, verb: str | None = None, *, required: bool = True) -> None:
     """Add the verbs to a parser; only the module of `verb` is imported and declares its arguments; an unknown verb is refused."""
     if verb is not None and not verb.startswith('-') and verb not in VERBS:
-        print(f"{parser.prog}: the verb must be one of {', '.join(VERBS)}, got '{verb}'{did_you_mean(verb, VERBS)}; "
-              f"see '{parser.prog} --help'", file=sys.stderr)
+        complain(f"{parser.prog}: the verb must be one of {', '.join(VERBS)}, got '{verb}'{did_you_mean(verb, VERBS)}; "
+                 f"see '{parser.prog} --help'")
         raise SystemExit(1)
     verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=required, parser_class=OneLineParser)
     for name, text in VERBS.items():
@@ -104,8 +110,8 @@ def add_verbs(parser: argparse.ArgumentParser, verb: str | None = None, *, requi
         added.common.add_argument('--verbose', action='store_true', help='print each phase with its time on standard error')
         added.set_defaults(run=module.run, verb_options=sorted(added._option_string_actions))
         words = [action for action in added._actions if action.required]
-        added.usage = f'%(prog)s {" ".join(map(_usage, words))} [options]'
-        examples = (f'  imu_calibration {name} {example}' for example in module.EXAMPLES)
+        added.usage = ' '.join(['%(prog)s', *map(_usage, words), '[options]'])
+        examples = (f'  imu_calibration {name} {example}'.rstrip() for example in module.EXAMPLES)
         added.epilog = '\n'.join(['examples:', *(folded(example, 6 * ' ', ' \\') for example in examples)])
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from imu_calibration.calibration.result import summary
+from imu_calibration.cli.parser import complain
 from imu_calibration.cli.terminal import STYLES, Terminal
 from imu_calibration.core.errors import printable, with_hint
 from imu_calibration.document.calibration import NUMBER_COLUMNS, PARAMETER_HEADINGS, parameter_rows
@@ -39,9 +40,8 @@ def show_table(out: Terminal, headings: Sequence[str], rows: Iterable[Sequence[s
 
 def warn(found: Sequence[dict[str, Any]] | Iterator) -> None:
     """Print the warnings about a recording (`preflight` in the statistics of a calibration) on standard error, a line each."""
-    import sys
     for item in found:
-        print(f'warning: {printable(item["text"])}', file=sys.stderr)
+        complain(f'warning: {printable(item["text"])}')
 
 
 def show_findings(out: Terminal, findings: tuple[CheckFinding, ...], hints: dict[str, str]) -> None:

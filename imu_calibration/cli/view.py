@@ -1,10 +1,9 @@
 """``imu_calibration view``: a recording's calibration as a picture that Foxglove opens."""
 
-import sys
 from argparse import Namespace
 
 from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, VerbResult, complain
 
 EXAMPLES = ('session --table table.yaml --output session.mcap', 'result --output parameters.mcap')
 
@@ -31,6 +30,6 @@ def run(options: Namespace) -> VerbResult:
     found = view(options.source, stand_of(options), **choices_of(options))
     found.save(options.output)
     for line in found.lacks:
-        print(f'warning: {line}', file=sys.stderr)
+        complain(f'warning: {line}')
     print(f'written: {options.output}; open it in Foxglove with the layout {layout}')
     return VerbResult(found.exit_code, {'output': str(options.output), 'layout': str(layout), 'lacks': found.lacks})

@@ -37,7 +37,7 @@ def run(options: Namespace) -> VerbResult:
     try:
         return _watch(NodeWatcher(context, options.node.strip('/')), options)
     except (KeyboardInterrupt, ExternalShutdownException):
-        return VerbResult(0)
+        return VerbResult(130)
     finally:
         context.try_shutdown()
 

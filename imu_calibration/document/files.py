@@ -159,9 +159,8 @@ def make_folder(path: str | PathLike[str]) -> Path:
 def output_folder(path: str) -> Iterator[Path]:
     """Yield the output folder; when the work is refused, folders made for it are removed."""
     missing = [folder for folder in (Path(path), *Path(path).parents) if not folder.exists()]
-    folder = make_folder(path)
     try:
-        yield folder
+        yield make_folder(path)
     except BaseException:
         with suppress(OSError):   # a folder with content is not removed
             for made in missing:

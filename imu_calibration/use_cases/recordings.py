@@ -2,9 +2,10 @@
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import closing
+from contextlib import closing, contextmanager
 from functools import partial
 from hashlib import sha256
 from os import PathLike
@@ -131,8 +132,33 @@ def process_mapper(jobs: int, done: Callable = lambda item: None) -> Callable:
             return [_told(function(item), done) for item in items]
         # Spawned, not forked: a fork of a process with threads can stop for ever.
         with ProcessPoolExecutor(min(jobs, len(items)), mp_context=multiprocessing.get_context('spawn')) as pool:
-            return _in_order([pool.submit(function, item) for item in items], as_completed, done, pool)
+            with _interruptions_ignored():
+                futures = [pool.submit(_until_sigterm, function, item) for item in items]
+            return _in_order(futures, as_completed, done, pool)
     return mapped
+
+
+@contextmanager
+def _interruptions_ignored():
+    """Ctrl+C reaches all processes of a terminal; those started here ignore it: this one interrupts and ends them."""
+    try:
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    except ValueError:   # not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
+def _until_sigterm(function, item):
+    """Run in a worker; SIGTERM interrupts the item, so that its temporary files are removed, and otherwise ends the process."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return function(item)
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _told(result, done):
@@ -145,6 +171,8 @@ def _in_order(futures, as_completed, done, pool):
         for future in as_completed(futures):
             done(future.result())
     except BaseException:
+        for worker in list((pool._processes or {}).values()):   # public from Python 3.14: terminate_workers
+            worker.terminate()
         pool.shutdown(wait=True, cancel_futures=True)
         raise
     return [future.result() for future in futures]

@@ -252,7 +252,7 @@ def test_what_was_decompressed_is_removed_on_sigterm(tmp_path):
     (bag / 'metadata.yaml').unlink()
     program = ('import time, msg_adapters.sqlite_file as f\nold = f.SqliteFile.count\n'
                'f.SqliteFile.count = lambda self: (print("decompressed", flush=True), time.sleep(60), old(self))[2]\n'
-               f'from imu_calibration.cli.main import main\nraise SystemExit(main(["inspect", {str(bag)!r}]))')
+               f'import sys\nfrom imu_calibration.__main__ import main\nsys.argv[1:] = ["inspect", {str(bag)!r}]\nraise SystemExit(main())')
     process = subprocess.Popen([sys.executable, '-c', program], env={**os.environ, 'TMPDIR': str(temporary)}, stdout=subprocess.PIPE,
                                stderr=subprocess.PIPE, text=True)
     assert process.stdout.readline() == 'decompressed\n' and list(temporary.glob('imu_calibration_*/*'))

@@ -100,12 +100,27 @@ def test_a_bar_has_the_name_of_its_phase_moves_between_reports_and_is_removed(mo
     assert screen.getvalue().rpartition('\r')[0].rpartition('\r')[2].strip() == '' and 'progress' not in [thread.name for thread in threading.enumerate()]
 
 
-def on_terminal(arguments, **environment):
-    """Return what a verb writes on a terminal of 80 columns."""
+def test_the_bar_is_removed_before_other_text(monkeypatch):
+    """The first line of a result followed the bar on its line."""
+    screen = Screen()
+    for name in ('stdout', 'stderr'):
+        monkeypatch.setattr(sys, name, screen)
+    with ProgressBars() as bars:
+        bars('solving', 20, 40)
+        bars('solving', 30, 40)
+        print('result')
+        print('warning', file=sys.stderr)
+        shown = screen.getvalue()
+        bars('drawing', 0, 4)
+    assert re.search(r'solving .*\r +\rresult\nwarning\n$', shown) and 'drawing' in screen.getvalue() and sys.stdout is screen
+
+
+def on_terminal(arguments, *, errors=False, code=0, **environment):
+    """Return what a verb writes on a terminal of 80 columns, with its standard error or without."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack('HHHH', 50, 80, 0, 0))
     kept = {name: value for name, value in os.environ.items() if name not in ('COLUMNS', 'NO_COLOR', 'FORCE_COLOR')}
-    process = subprocess.Popen([sys.executable, '-m', 'imu_calibration', *arguments], cwd=ROOT, stdout=theirs, stderr=subprocess.DEVNULL,
+    process = subprocess.Popen([sys.executable, '-m', 'imu_calibration', *arguments], cwd=ROOT, stdout=theirs, stderr=theirs if errors else subprocess.DEVNULL,
                                env=kept | {'TERM': 'xterm', **environment})
     os.close(theirs)
     found = b''
@@ -118,7 +133,7 @@ def on_terminal(arguments, **environment):
             break
         found += part
     os.close(ours)
-    assert process.wait() == 0
+    assert process.wait() == code
     return found
 
 
@@ -131,6 +146,13 @@ def test_no_line_is_wider_than_the_terminal(arguments):
 
 
 @pytest.mark.live
+@pytest.mark.parametrize('arguments', [['calibrate', SESSION, '--table', 'nowhere.yaml', '--output', 'never'], ['calibrate', SESSION, '--gravty', '9'], ['calibrat']])
+def test_no_line_of_an_error_is_wider_than_the_terminal(arguments):
+    lines = on_terminal(arguments, errors=True, code=1).decode().splitlines()
+    assert len(lines) > 1 and max(map(len, lines)) <= 80
+
+
+@pytest.mark.live
 def test_colour_is_for_terminals_and_not_with_no_color():
     assert b'\x1b[32m' in on_terminal(['inspect', SESSION])
     assert b'\x1b[3' not in on_terminal(['inspect', SESSION], NO_COLOR='1')
@@ -139,12 +161,11 @@ def test_colour_is_for_terminals_and_not_with_no_color():
 
 
 @pytest.mark.live
-@pytest.mark.parametrize('moment', ['the first import', 'the verb'])
-def test_an_early_interruption_ends_with_130_in_one_line(moment, tmp_path):
-    """The signal comes as soon as the module is there: before or after numpy is imported."""
-    watched = 'imu_calibration.cli.parser' if moment == 'the first import' else 'numpy'
+@pytest.mark.parametrize('module', ['imu_calibration.cli.main', 'imu_calibration.cli.parser', 'numpy', 'datetime', 'scipy'])
+def test_an_early_interruption_ends_with_130_in_one_line(module):
+    """The signal arrives while a module is imported; numpy turned it into a broken installation where it imports `datetime`."""
     program = ('import os, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n'   # a background job ignores it
-               f'class Watch:\n    def find_spec(self, name, path=None, target=None):\n        if name == {watched!r}:\n'
+               f'class Watch:\n    def find_spec(self, name, path=None, target=None):\n        if name == {module!r}:\n'
                '            sys.meta_path.remove(self)\n            os.kill(os.getpid(), signal.SIGINT)\n'
                'sys.meta_path.insert(0, Watch())\n'
                'from imu_calibration.__main__ import main\nsys.exit(main())\n')
