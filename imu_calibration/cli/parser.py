@@ -75,7 +75,7 @@ def complain(text: str) -> None:
     print(folded(text, stream=sys.stderr), file=sys.stderr)
 
 
-def folded(text: str, indent: str = '', last: str = '', stream: TextIO | None = None) -> str:
+def folded(text: str, indent: str = '', last: str = '', *, stream: TextIO | None = None) -> str:
     """Return a line for `stream` (standard output), broken between words at the width of a terminal; `last` ends each but the last part."""
     if not (stream or sys.stdout).isatty():
         return text
