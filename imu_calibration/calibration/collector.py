@@ -30,9 +30,11 @@ from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.gathered import (
     KEPT_POSES,
     KEPT_SAMPLES,
+    MAX_LIVE_SAMPLES,
     Gathered,
     HeldOut,
     HeldOutBlock,
+    SpreadWindows,
     WindowStore,
     naming,
     owned_window,
@@ -342,6 +344,7 @@ class LiveCollector(Collector):
                  told: Callable[[Window], slice]):
         super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
         self.store, self._told, self._completed = store, told, {}
+        self.gathered.spreads = [SpreadWindows(MAX_LIVE_SAMPLES)]
 
     def _columns(self, window):
         told, designs = self._told(window), {}

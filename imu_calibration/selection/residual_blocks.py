@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import cholesky, solve_triangular
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import References, columns
@@ -26,6 +26,8 @@ MIN_BLOCK_SECONDS = 0.25
 """Least length of a block of a moving window, s; at rest a window is one block."""
 MAX_RESIDUAL_BLOCKS = 1200
 """Blocks of one recording, about: their full covariance is factored."""
+COVARIANCE_PARTS = 16
+"""Parts of the rows of that covariance, which are computed one after the other."""
 AT_A_TIME = 256
 """Blocks whose columns are in memory at once."""
 WHITE_BENDS, PER_FREEDOM = 6.0, 35 / 18
@@ -84,11 +86,12 @@ class BlockWhitener:
     def __init__(self, blocks: RestBlocks, select: np.ndarray):
         variance, time = blocks.variance[select], blocks.time[select]
         self.scale = np.sqrt(np.median(variance / variance.mean(axis=1, keepdims=True), axis=0))
-        apart = np.abs(time[:, None] - time[None, :])
         covariance = np.diag(variance.mean(axis=1))
-        for process in blocks.processes:
-            covariance += process.sd**2 * np.exp(-apart / process.time)
-        self._factor, self._select = np.linalg.cholesky(covariance), select
+        for rows in np.array_split(np.arange(len(time)), COVARIANCE_PARTS):   # intermediate arrays of a part, not of the matrix
+            apart = np.abs(time[rows, None] - time[None, :])
+            for process in blocks.processes:
+                covariance[rows] += process.sd**2 * np.exp(-apart / process.time)
+        self._factor, self._select = cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False), select
 
     def __call__(self, rows: np.ndarray, axis: int | None = None) -> np.ndarray:
         """Return whitened rows of an axis, shape of the selection; of all axes, still to be divided by ``scale[axis]``, without `axis`."""

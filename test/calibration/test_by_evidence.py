@@ -16,7 +16,6 @@ from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable import gathered
 from imu_calibration.references.turntable.gathered import SpreadWindows
 from imu_calibration.report.diagnosis_page import diagnosis_report
 from imu_calibration.selection import investigation, questions
@@ -103,15 +102,14 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
     assert not _disagreement(whole, bare.param_names).any()
 
 
-def test_windows_for_the_search_are_spread_and_bounded(monkeypatch):
+def test_windows_for_the_search_are_spread_and_bounded():
     """Of a long session every so many-th window of each kind is kept, moving ones and rests alike; of a short one all."""
     windows = calibrated(make_pair(None, 11).first).windows
     every = SpreadWindows()
     for window in windows:
         every.add(window)
     assert [w.time[0] for w in every.windows] == [w.time[0] for w in windows]
-    monkeypatch.setattr(gathered, 'MAX_KEPT_SAMPLES', 4000)
-    some = SpreadWindows()
+    some = SpreadWindows(4000)
     for window in windows:
         some.add(window)
     assert some.n_samples == sum(len(w.time) for w in some.windows) <= 4000

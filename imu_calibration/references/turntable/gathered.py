@@ -211,18 +211,20 @@ def _linearised(blocks, solution, prior):
 
 
 MAX_KEPT_SAMPLES = 100_000
-"""Most samples kept; beyond it every second window of each kind is removed."""
+"""Most samples kept of a recording."""
+MAX_LIVE_SAMPLES = 50_000
+"""Most samples kept of a session; a diagnosis needs about 1.4 kB of memory for each of them."""
 
 
 class SpreadWindows:
     """
     Every so many-th window of each kind, so that memory and the time of a search are bounded.
 
-    The selection depends only on the recording.
+    The selection depends only on the recording. Above `most` samples every second window of each kind is removed.
     """
 
-    def __init__(self) -> None:
-        self.n_samples, self._stride, self._counts, self._kept = 0, 1, {}, []
+    def __init__(self, most: int = MAX_KEPT_SAMPLES) -> None:
+        self.most, self.n_samples, self._stride, self._counts, self._kept = most, 0, 1, {}, []
 
     def add(self, window: Window) -> None:
         """Add a window in order of time, as a copy in separate memory (`owned_window`)."""
@@ -231,14 +233,14 @@ class SpreadWindows:
             return
         self._kept.append((number, window))
         self.n_samples += len(window.time)
-        while self.n_samples > MAX_KEPT_SAMPLES and len(self._kept) > 1:
+        while self.n_samples > self.most and len(self._kept) > 1:
             self._stride *= 2
             self._kept = [(number, window) for number, window in self._kept if number % self._stride == 0]
             self.n_samples = sum(len(window.time) for _, window in self._kept)
 
     def copy(self) -> 'SpreadWindows':
         """Return an independent copy; the windows are shared."""
-        twin = SpreadWindows()
+        twin = SpreadWindows(self.most)
         twin.n_samples, twin._stride, twin._counts, twin._kept = self.n_samples, self._stride, dict(self._counts), list(self._kept)
         return twin
 
