@@ -22,7 +22,7 @@ from imu_calibration.calibration.result import GRAVITY_SD, CalibrationResult, Er
 from imu_calibration.calibration.table_calibration import CheckResult
 from imu_calibration.compensation.stream import compensate_readings
 from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.core.samples import ImuSamples, NominalScaling, SampleBlock, TemperatureSamples
+from imu_calibration.core.samples import ImuSamples, JoinedParts, NominalScaling, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS, UNITS, Role
@@ -132,13 +132,14 @@ def read_by_hand(blocks: Iterable[SampleBlock], nominal: NominalScaling | None =
         When no usable sample remains.
 
     """
-    cleaner, imus, temperatures = BlockCleaner(nominal=nominal, watchers=watchers), [], []
+    cleaner, joined, temperatures = BlockCleaner(nominal=nominal, watchers=watchers), JoinedParts(), []
     for cleaned in cleaner.all_of(blocks):
-        imus += [imu for _, imu in cleaned.imu]
+        for _, imu in cleaned.imu:
+            joined.add(imu)
         temperatures += [temperature for _, temperature in cleaned.temperature]
-    if not imus:
+    if not len(joined):
         raise InputError('the recording must hold Imu messages that can be used, it holds none; check the topic')
-    imu, warm = ImuSamples.concatenate(imus), None
+    imu, warm = joined.samples(), None
     if temperatures:
         known = TemperatureSamples.concatenate(temperatures)
         start = imu.stamp_ns[0]  # epochs in nanoseconds do not fit a float

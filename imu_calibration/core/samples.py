@@ -1,6 +1,7 @@
 """Arrays of samples from a bag or a topic, independent of messages and files."""
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,6 +47,42 @@ def _pick(value, index):
 
 def _join(values):
     return np.concatenate(values) if isinstance(values[0], np.ndarray) else values[0]
+
+
+class JoinedParts:
+    """Joins samples part by part; `concatenate` needs the memory of all parts twice."""
+
+    SPARE = 8
+    """The arrays grow by this fraction of their length."""
+
+    def __init__(self) -> None:
+        self._first: Any = None
+        self._columns: dict[str, np.ndarray] = {}
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add(self, part: _Columns) -> None:
+        """Append samples of one kind."""
+        if self._first is None:
+            self._first = part.select(slice(0))
+            self._columns = {name: values.copy() for name, values in vars(self._first).items() if isinstance(values, np.ndarray)}
+        stop = self._count + len(part)
+        for name, column in self._columns.items():
+            if len(column) < stop:
+                self._resize(name, max(stop, len(column) + len(column) // self.SPARE))
+            column[self._count:stop] = getattr(part, name)
+        self._count = stop
+
+    def samples(self) -> Any:
+        """Return the joined samples; nothing can be added after this."""
+        for name in self._columns:
+            self._resize(name, self._count)
+        return replace(self._first, **self._columns)
+
+    def _resize(self, name, count):
+        self._columns[name].resize((count, *self._columns[name].shape[1:]), refcheck=False)   # in place: no view exists
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,9 +216,12 @@ def runs_of(flags: ArrayLike) -> np.ndarray:
 
 def smallest_step(readings: np.ndarray, least: float = 1e-9) -> np.ndarray:
     """Return the smallest step from one reading to the next in each column, (n, k), above the share `least` of the largest, shape (k,)."""
-    step = np.abs(np.diff(readings, axis=0))
-    real = step > least * np.maximum(np.abs(readings).max(axis=0, initial=0.0), 1e-12)
-    return np.min(np.where(real, step, np.inf), axis=0, initial=np.inf)
+    return np.array([_smallest_step(column, least) for column in readings.T])
+
+
+def _smallest_step(column, least):
+    step = np.abs(np.diff(column))
+    return np.min(step, where=step > least * max(np.abs(column).max(initial=0.0), 1e-12), initial=np.inf)
 
 
 def rounding_variance(readings: np.ndarray) -> np.ndarray:

@@ -75,6 +75,13 @@ def low_passed(values: np.ndarray, width: int) -> np.ndarray:
     return values
 
 
+def _low_passed_piece(values, first, last, width):
+    """Return `low_passed` of all values, from `first` to before `last`."""
+    reach = 3 * (width // 2)
+    start = max(first - reach, 0)
+    return low_passed(values[start:last + reach], width)[first - start:last - start]
+
+
 def _steady(force_s, rate_s, period, *, ratio, resting):
     """Return a mask of the samples in a short span at rest whose variance is about the minimum of the spans around."""
     cell = max(1, min(int(_GRID / period), len(force_s)))
@@ -170,11 +177,13 @@ class _CellSums:
     """Sums over cells of samples, from which variances over any span of cells follow."""
 
     def __init__(self, values, edges):
-        rows = np.ascontiguousarray(values.T)
-        centred = rows - rows.mean(axis=1, keepdims=True)
-        self._count = edges
-        self._sum = _running(np.add.reduceat(centred, edges[:-1], axis=1))
-        self._square = _running(np.add.reduceat(np.einsum('ij,ij->j', centred, centred), edges[:-1]))
+        sums, squares = [], np.zeros(len(values))
+        for axis in values.T:   # one at a time: a long recording is large
+            row = np.ascontiguousarray(axis)
+            centred = row - row.mean()
+            sums.append(np.add.reduceat(centred, edges[:-1]))
+            squares += np.square(centred, out=centred)
+        self._count, self._sum, self._square = edges, _running(np.array(sums)), _running(np.add.reduceat(squares, edges[:-1]))
 
     def variance(self, width):
         """Return the variance over `width` cells from each cell on, axes added."""
@@ -287,7 +296,7 @@ def _at_one_rate(rate, found, period, shortest):
     if not found:
         return found
     noise = np.median([rate[piece].std(axis=0) for piece in found], axis=0)
-    least = np.maximum(noise, 1e-3 * np.abs(rate - np.median(rate, axis=0)).max(axis=0))
+    least = np.maximum(noise, 1e-3 * _farthest(rate, np.array([np.median(axis) for axis in rate.T])))
     width, parts = max(10, int(round(_STEP_SPAN / period))), []
     for piece in found:
         count = (piece.stop - piece.start) // width
@@ -298,21 +307,26 @@ def _at_one_rate(rate, found, period, shortest):
     return parts
 
 
+def _farthest(values, centre):
+    """Return ``max |values - centre|`` of each column."""
+    return np.maximum(values.max(axis=0) - centre, centre - values.min(axis=0))
+
+
 def _trimmed(imu, found, period, shortest):
     """Trim both ends of intervals where the low-passed readings exceed the scatter of the middle: a turn begins below the noise."""
     first, last = (np.array([getattr(piece, end) for piece in found], int) for end in ('start', 'stop'))
     width = 2 * int(round(BELOW / period / 2)) + 1
     for values in (imu.force_s, imu.rate_s) if found else ():
-        slow = low_passed(values, width)
-        middles = [slice(*np.linspace(a, b, 5).astype(int)[1:4:2]) for a, b in zip(first, last)]
-        centres = [slow[middle].mean(axis=0) for middle in middles]
-        spread = [np.mean((slow[middle] - centre)**2) for middle, centre in zip(middles, centres)]
+        slow = [_low_passed_piece(values, a, b, width) for a, b in zip(first, last)]
+        middles = [slice(*(np.linspace(a, b, 5).astype(int)[1:4:2] - a)) for a, b in zip(first, last)]
+        centres = [piece[middle].mean(axis=0) for piece, middle in zip(slow, middles)]
+        spread = [np.mean((piece[middle] - centre)**2) for piece, middle, centre in zip(slow, middles, centres)]
         spread = np.maximum(np.maximum(spread, np.median(spread)), least_variance(values) / 3 / width)
-        for k, (middle, centre) in enumerate(zip(middles, centres)):
-            off = np.sum((slow[first[k]:last[k]] - centre)**2, axis=1) > 3 * _LEAVES**2 * spread[k]
-            before, after = off[:middle.start - first[k]], off[middle.stop - first[k]:]
-            last[k] = middle.stop + int(np.argmax(after)) if after.any() else last[k]
-            first[k] = middle.start - int(np.argmax(before[::-1])) if before.any() else first[k]
+        for k, (piece, middle, centre) in enumerate(zip(slow, middles, centres)):
+            off = np.sum((piece - centre)**2, axis=1) > 3 * _LEAVES**2 * spread[k]
+            before, after, start = off[:middle.start], off[middle.stop:], first[k]
+            last[k] = start + middle.stop + int(np.argmax(after)) if after.any() else last[k]
+            first[k] = start + middle.start - int(np.argmax(before[::-1])) if before.any() else start
     return [slice(int(a), int(b)) for a, b in zip(first, last) if (b - a) * period >= shortest]
 
 
@@ -323,7 +337,7 @@ def _not_turning(rate, found):
     means = np.array([rate[piece].mean(axis=0) for piece in found])
     noise = np.median([rate[piece].std(axis=0) for piece in found], axis=0)
     usual = np.median(means, axis=0)
-    limit = np.maximum(_TURNING_SD * noise, 0.01 * np.abs(rate - usual).max(axis=0))
+    limit = np.maximum(_TURNING_SD * noise, 0.01 * _farthest(rate, usual))
     keep = np.all(np.abs(means - usual) <= limit, axis=1)
     if len(found) >= _ENOUGH:   # an isolated deviation from both neighbours; the drift of warming biases is smooth
         step = np.diff(means, axis=0)

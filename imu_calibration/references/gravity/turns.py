@@ -72,30 +72,34 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
         Readings in any unit.
 
     """
-    fresh = np.concatenate([[True], np.any(np.diff(rate, axis=0) != 0, axis=1)])   # a reading published twice is one reading
+    fresh = np.ones(len(rate), bool)   # a reading published twice is one reading
+    fresh[1:] = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rate.T])
     ended = np.zeros(len(rate), bool)
     for signed, axes in ((np.abs, range(3)), *((signed, [axis]) for axis in range(3) for signed in (np.positive, np.negative))):
-        ended |= _at_end(signed(rate[:, axes]), fresh)   # one copy of a long recording at a time
+        ended |= _at_end(signed, rate.T[axes], fresh)
     return ended
 
 
-def _at_end(values, fresh):
-    """Return the rows with a value at the largest of all `values` (n, m), when that is the end of a range."""
-    some = values[fresh].ravel()
-    some = np.sort(np.partition(some, -MAX_RANGE_READINGS)[-MAX_RANGE_READINGS:] if len(some) > MAX_RANGE_READINGS else some)
+def _at_end(signed, axes, fresh):
+    """Return the samples at the largest value of ``signed(axes)``, shape (m, n), when that is the end of a range."""
+    some = np.sort(np.concatenate([_largest(signed(axis[fresh])) for axis in axes]))[-MAX_RANGE_READINGS:]   # one copy of an axis at a time
     step = np.diff(some)
     step = step[step > 1e-9 * np.abs(some[-1])].min(initial=np.inf)
-    margin = 1.5 * step if np.isfinite(step) and values.shape[1] > 1 else 0.5 * step   # two's complement: one end is larger by a step
+    margin = 1.5 * step if np.isfinite(step) and len(axes) > 1 else 0.5 * step   # two's complement: one end is larger by a step
     margin = min(margin, 1e-4 * np.abs(some[-1]))
-    at = (values >= some[-1] - margin).any(axis=1)
+    at = np.logical_or.reduce([signed(axis) >= some[-1] - margin for axis in axes])
     below = some[some < some[-1] - margin][-TOP:]
     if len(below) < TOP:
-        return np.zeros(len(values), bool)
+        return np.zeros(len(fresh), bool)
     chance = TOP * (margin + 0.5 * step) / (some[-1] - below[0]) if np.isfinite(step) else 0.0
     runs = np.diff(runs_of(at[fresh]))
     # the top of one smooth turn may fill a coarse step for some samples
     number = runs.sum() if chance < CERTAIN else np.maximum(runs - SUMMIT, 0).sum() + len(runs)
-    return at if number >= max(2, CROWDED * chance) else np.zeros(len(values), bool)
+    return at if number >= max(2, CROWDED * chance) else np.zeros(len(fresh), bool)
+
+
+def _largest(values):
+    return np.partition(values, -MAX_RANGE_READINGS)[-MAX_RANGE_READINGS:] if len(values) > MAX_RANGE_READINGS else values
 
 
 def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, *, poses: Poses,
