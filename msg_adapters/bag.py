@@ -321,7 +321,8 @@ def _choose(path, topics, message_type, asked, required, lenient=False):
         raise InputError(f'{path} must have one {message_type} topic or one named {DEFAULT_TOPICS[message_type]}, '
                          f'got {", ".join(fitting)}; choose one', key=key, code='topic_ambiguous')
     if required:
-        raise InputError(f'{path} must have a {message_type} topic, got none; {_listing(topics, fitting)}', code='no_topic_of_type')
+        raise InputError(f'{path} must have a {message_type} topic, got none: {_listing(topics, fitting)}; record it'
+                         f'{", or calibrate by hand, without a table" * (message_type == JOINT_STATE_TYPE)}', code='no_topic_of_type')
     return None
 
 

@@ -47,7 +47,8 @@ SPELLINGS = {
 }
 """Quantity -> spelling in headers -> unit."""
 COLUMN_PATTERNS = (
-    ('time', r'((logging|sensor|device|imu|sample) ?)?time|timestamp|t|epoch|seconds|sec|time ?stamp.*|(.* )?stamp|.*elapsed'),
+    ('time', r'((logging|sensor|device|imu|sample) ?)?time|timestamp|t|epoch|seconds|sec|time ?stamp.*|'
+     r'(.* )?stamp|.*elapsed|time since start.*'),
     ('force', r'(a|acc|accel|accelerometer|acceleration|f|specific force|a rs s|(accelerometer|acc|raw|imu|total) ?accel\w*|'
      r'(.* )?linear acceleration)'),
     ('rate', r'(g|w|gyr|gyro|gyroscope|omega|rate|w rs s|(angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
@@ -297,7 +298,7 @@ def _guess(table):
     for name in table.names:
         words, unit_text = _words(name)
         joint = re.fullmatch(r'joint[ ._](\w+?)(?: (?:position|angle))?', words)
-        axis = re.fullmatch(r'(.*?) ?([xyz])', words)
+        axis = re.fullmatch(r'(.*?) ?([xyz])', re.sub(r'^([xyz]) (.*)$', r'\2 \1', words))
         for quantity, pattern in COLUMN_PATTERNS:
             if quantity in axes:
                 if axis and re.fullmatch(pattern, axis.group(1)):

@@ -15,6 +15,7 @@ from imu_calibration.allan.terms import LEAST_SCALES, PROCESSES, TERM_DETERMINED
 from imu_calibration.allan.trends import MAX_TREND_BLOCKS, AxisTrend, Blocks, TrendSearch
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.progress import reported
 from imu_calibration.core.samples import NominalScaling, SampleBlock
 from imu_calibration.effects.base import AXES, SENSORS
 
@@ -199,7 +200,7 @@ def identify_noise(source: Callable[[], Iterable[SampleBlock]], nominal: Nominal
 
     """
     record = read_rest(source, nominal)
-    axes = [identify_axis(moments) for moments in record.moments]
+    axes = [identify_axis(moments) for moments in reported('identifying the noise', record.moments, len(record.moments))]
     longest = max(part.seconds for part in record.parts)
     searches = {k: ToneSearch(axis.oscillation[0], record.curve.period, k, longest=longest)
                 for k, axis in enumerate(axes) if axis.oscillation}

@@ -36,7 +36,7 @@ def run(options: Namespace) -> VerbResult:
     found = compensate(options.bag, options.calibration, **{name: getattr(options, name) for name in names})
     for line in found.warnings:
         print(folded(f'note: {line}'))
-    print(f'written: {options.output} with {options.corrected_topic} ({found.count} samples)')
+    print(folded(f'written: {options.output} with {options.corrected_topic} ({found.count} samples)'))
     if found.lost:
         print('lost: ' + ', '.join(f'{count} {reason}' for reason, count in found.lost.items()))
     return VerbResult(found.exit_code, {'output': str(options.output), 'topic': options.corrected_topic, 'count': found.count,

@@ -30,6 +30,6 @@ def run(options: Namespace) -> VerbResult:
     if log.unused:
         print(folded(f'unused: {", ".join(log.unused)}'))
     write_session(options.output, log.imu, log.joints, temperature=log.temperature, storage=options.storage)
-    print(f'written: {options.output} ({len(log.imu)} Imu)')
+    print(folded(f'written: {options.output} ({len(log.imu)} Imu)'))
     columns = [{'quantity': c.quantity, 'joint': c.joint, 'names': c.names, 'unit': c.unit, 'origin': c.origin} for c in log.columns]
     return VerbResult(0, {'output': str(options.output), 'count': len(log.imu), 'columns': columns, 'unused': log.unused})

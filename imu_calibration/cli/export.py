@@ -41,7 +41,7 @@ def run(options: Namespace) -> VerbResult:
                                bag=options.bag, stand=stand, topics=topics, anyway=options.anyway)
     for line in found.lines:
         print(folded(line))
-    print(f'written: {options.output}')
+    print(folded(f'written: {options.output}'))
     return VerbResult(found.exit_code, {'output': options.output, 'lines': found.lines})
 
 

@@ -28,5 +28,5 @@ def run(options: Namespace) -> VerbResult:
         print(folded(line))
     if held:
         print(folded(f'not in the file, held at the prior: {", ".join(held)}'))
-    print(f'written: {options.output}')
+    print(folded(f'written: {options.output}'))
     return VerbResult(0, {'output': str(options.output), 'held': held})

@@ -49,4 +49,4 @@ def _show(found, rates, folder, names):
     print()
     for line in [*document.lines(found.figures), *document.filter_lines(found.figures, rates, found.horizon)]:
         print(folded(line, '    '))
-    print(f'written: {names} in {folder}')
+    print(folded(f'written: {names} in {folder}'))

@@ -69,7 +69,7 @@ def _run_by_hand(options):
         print(folded(f'{number:3d}  {step.words}', '     '))
     for line in hand_summary(made.plan):
         print(folded(line, '    '))
-    print(f'written: plan.yaml in {folder}')
+    print(folded(f'written: plan.yaml in {folder}'))
     return VerbResult(made.exit_code, hand_plan_to_mapping(made.plan, made.provenance))
 
 
@@ -100,4 +100,4 @@ def _show(planned, folder):
         print(f'... and {len(made.motions) - MAX_PRINTED_MOTIONS} more, in plan.yaml')
     for line in [*summary(made), *planned.notes]:
         print(folded(line, '    '))
-    print(f'written: plan.yaml and the trajectory in {folder}')
+    print(folded(f'written: plan.yaml and the trajectory in {folder}'))

@@ -252,7 +252,7 @@ def _cause(match, matrix, seen, table):
         return 'left-handed axes, which no mounting explains; correct signs and order in the driver, or the joint axes in the table'
     fits = ''
     if table is not None and np.trace(seen) > 2.5:
-        fits = ', [' + ', '.join(f'{angle:.0f}' for angle in _mount_rpy_deg(matrix, table)) + '] would fit'
+        fits = ', [' + ', '.join(f'{angle:z.0f}' for angle in _mount_rpy_deg(matrix, table)) + '] would fit'
     return f'the sensor is turned against the table; correct mount.rpy_deg in the table{fits}'
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from imu_calibration.calibration.installation_angles import AXIS_PAIRS, derive, in_paper_units
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.compensation.compensate import arms_of
+from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import DEG, decimals
 from imu_calibration.document import files
 from imu_calibration.effects.base import SENSORS, Role
@@ -45,11 +46,14 @@ class Drawn(str):
         return self.figure.axes
 
     def save(self, path: str | PathLike) -> None:
-        """Write the figure: as PDF if the name ends with .pdf, otherwise as SVG."""
-        if Path(path).suffix.lower() == '.pdf':
-            files.write_whole(path, self.pdf)
-        else:
+        """Write the figure as PDF, SVG or PNG, by the end of the name; raises InputError for others."""
+        kind = Path(path).suffix.lower()
+        if kind not in ('.pdf', '.svg', '.png'):
+            raise InputError(f'the name of a figure must end with .pdf, .svg or .png, got {path}; change it', code='figure_suffix')
+        if kind == '.svg':
             files.write_text(path, str(self))
+        else:
+            files.write_whole(path, self.pdf if kind == '.pdf' else self.png)
 
     @property
     def pdf(self) -> bytes:
@@ -57,6 +61,15 @@ class Drawn(str):
         from matplotlib.backends.backend_pdf import FigureCanvasPdf
         whole = io.BytesIO()
         FigureCanvasPdf(self.figure).print_pdf(whole, metadata={'CreationDate': None})
+        return whole.getvalue()
+
+    @property
+    def png(self) -> bytes:
+        """The figure as PNG on white, 200 pixels per inch."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        whole = io.BytesIO()
+        FigureCanvasAgg(self.figure)
+        self.figure.savefig(whole, format='png', dpi=200, facecolor='white')
         return whole.getvalue()
 
     @property

@@ -7,6 +7,7 @@ from os import PathLike
 from imu_calibration.allan.document import exit_code, lines, noise_to_text
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification, figures_of, identify_noise
+from imu_calibration.core.progress import report
 from imu_calibration.core.samples import NominalScaling, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.preprocessing.checks import warnings
@@ -45,6 +46,7 @@ class IdentifiedNoise:
     def report(self) -> str:
         """The report as one HTML page."""
         from imu_calibration.report.noise_page import noise_report
+        report('drawing the report')
         return noise_report(self.result, self.figures, self.horizon)
 
     def save(self, folder: str | PathLike, *, report: bool = True) -> None:

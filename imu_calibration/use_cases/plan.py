@@ -14,6 +14,7 @@ import numpy as np
 from imu_calibration.calibration.table_calibration import calibration_of_saved
 from imu_calibration.core import documents
 from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.core.progress import report
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
@@ -74,6 +75,7 @@ class Planned:
     def report(self) -> str:
         """The report as one HTML page."""
         from imu_calibration.report.plan_page import plan_report
+        report('drawing the report')
         return plan_report(self.plan, self.provenance)
 
     def plot(self) -> Drawn:
@@ -209,6 +211,7 @@ class PlannedByHand:
     def report(self) -> str:
         """The report as one HTML page."""
         from imu_calibration.report.plan_page import hand_plan_report
+        report('drawing the report')
         return hand_plan_report(self.plan, self.model.model, self.provenance)
 
     def save(self, folder: str | PathLike, *, report: bool = True) -> None:

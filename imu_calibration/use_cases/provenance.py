@@ -95,7 +95,7 @@ def require_same_inputs(folder: str | PathLike, found: Mapping[str, Any]) -> Non
     parts = {'verb': before.get('verb', found['verb']) == found['verb'], 'recordings': made_from(before) == made_from(found),
              'reference': _stands(before) == _stands(found)}
     if not all(parts.values()):
-        raise InputError(f'a result must not replace that of other inputs, {path} has another '
+        raise InputError(f'a result must not replace that of other inputs, {path} differs in '
                          f'{" and ".join(name for name, same in parts.items() if not same)}; choose another folder, or overwrite it',
                          key='force', code='other_result')
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from imu_calibration.core import documents
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.progress import report
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
@@ -50,6 +51,7 @@ class Simulated:
     def save(self, path: str | PathLike, *, storage: str = 'sqlite3', compression: str = 'none') -> None:
         """Write a rosbag2 folder ('sqlite3' or 'mcap', chunks of an mcap packed by 'zstd' or 'lz4') with truth.yaml and table.yaml."""
         from msg_adapters.write import write_session
+        report(f'writing {Path(path).name}')
         samples, packed = self.samples, {} if compression == 'none' else {'compression': compression}
         write_session(path, cast(ImuSamples, samples.imu), samples.joints, temperature=samples.temperature, storage=storage, **packed)
         files.write_text(Path(path) / 'truth.yaml', calibration_to_text(self.truth))
@@ -98,6 +100,7 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
         When a name is unknown, or table, profile and calibration do not fit together.
 
     """
+    report('simulating')
     given = table_of(table or config_file('table_simulated.yaml'))
     motion = make_profile(profile, seed, given, duration=duration)
     mover = given if motion.table is None else Table.from_mapping(motion.table)
@@ -152,6 +155,7 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
     if all('noise_sd' in known.statistics.get(sensor, {}) for sensor in SENSORS):
         noise = {sensor: ReplayNoise(*known.noise(sensor), known.statistics[sensor].get('wander_time_s') or BIAS_TIME)
                  for sensor in SENSORS}
+    report('simulating')
     samples, lost = run_replay(source_of(recording, topics, given.joint_names)(), given, known.model, values=known.values, noise=noise,
                                seed=seed)
     truth = replace(known, provenance={'simulated': {'seed': seed, 'replay': name_of(recording)}})

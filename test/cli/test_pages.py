@@ -60,3 +60,10 @@ def test_arrays_calibrate_as_the_readme_shows(tmp_path):
     names = {'time': imu.stamp_ns * 1e-9, 'force': imu.force_s, 'rate': imu.rate_s}
     exec(code.replace("'result'", repr(str(tmp_path / 'result'))), names)
     assert (tmp_path / 'result' / 'calibration.yaml').is_file() and imu_calibration.load(tmp_path / 'result' / 'calibration.yaml')
+
+
+def test_the_messages_of_typical_mistakes_are_those_of_the_product():
+    code = '\n'.join(path.read_text() for folder in ('imu_calibration', 'msg_adapters') for path in (ROOT / folder).rglob('*.py'))
+    rows = re.findall(r'^\| `(.*?)` \|', (ROOT / 'docs/turntable.md').read_text().partition('## Typical mistakes')[2], re.MULTILINE)
+    sentences = [row.partition(' ... ')[0] for row in rows if '.' not in row.split()[0]]
+    assert len(sentences) >= 6 and [text for text in sentences if text not in code] == []

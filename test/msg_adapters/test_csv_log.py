@@ -60,7 +60,8 @@ def test_units_follow_from_the_values(tmp_path, imu, force_size, force_unit, rat
     ('__time\t/imu/linear_acceleration/x\t/imu/linear_acceleration/y\t/imu/linear_acceleration/z\t/imu/angular_velocity/x\t'
      '/imu/angular_velocity/y\t/imu/angular_velocity/z', 1.0, 1.0, 1.0, '\t'),
     ('# t_us acc_x_mg acc_y_mg acc_z_mg gyro_x_dps gyro_y_dps gyro_z_dps', 1e-3 * STANDARD_GRAVITY, DEG, 1e-6, ' '),
-], ids=['brackets', 'camel case', 'paths', 'suffixes'])
+    ('Time since start in ms ,X_accel,Y_accel,Z_accel,X_gyro,Y_gyro,Z_gyro', 1.0, 1.0, 1e-3, ','),
+], ids=['brackets', 'camel case', 'paths', 'suffixes', 'axis first'])
 def test_headers_name_columns_and_units(tmp_path, imu, header, force_size, rate_size, time_size, delimiter):
     path = write(tmp_path / 'log.csv', header, seconds(imu) / time_size, imu.force_s / force_size, imu.rate_s / rate_size, delimiter=delimiter)
     assert_read(read_csv(path), imu)

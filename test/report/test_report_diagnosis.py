@@ -8,9 +8,11 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from refusal import refused
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.result import exit_code
+from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.effects.catalogue import term
@@ -67,9 +69,11 @@ def test_it_is_drawn_against_its_cause(result):
 
 def test_a_figure_is_svg_pdf_axes_and_arrays(result, tmp_path):
     drawing = draw_finding(result.diagnosis, result.diagnosis.findings[0], 1)
-    for name, head in (('p.pdf', b'%PDF-1.4'), ('p.svg', b'<svg ')):
+    for name, head in (('p.pdf', b'%PDF-1.4'), ('p.svg', b'<svg '), ('p.png', b'\x89PNG')):
         drawing.save(tmp_path / name)
         assert (tmp_path / name).read_bytes().startswith(head)
+    with refused(InputError, 'figure_suffix', 'p.jpg'):
+        drawing.save(tmp_path / 'p.jpg')
     assert drawing.pdf == drawing.pdf
     left, right = drawing.data
     axis, _, values = cause_of(result.diagnosis, 'gyroscope', ('force',))
