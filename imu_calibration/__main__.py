@@ -43,13 +43,13 @@ def main() -> int:
             signal.signal(number, handler)
     try:
         from imu_calibration.cli.main import main as run_verb
-        code = run_verb()
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        return code
+        return run_verb()
     except KeyboardInterrupt:
         print('imu_calibration: interrupted; no file was written', file=sys.stderr)
         return 130
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 if __name__ == '__main__':

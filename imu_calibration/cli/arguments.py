@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from imu_calibration.use_cases.choices import Choices
     from imu_calibration.use_cases.stand import Stand
 
-BAG = 'rosbag2 folder, .db3, .mcap, ROS 1 .bag, or a text log (.csv)'
+BAG = 'rosbag2 folder, .db3, .mcap, ROS 1 .bag, text (.csv)'
 
 
 def add_topic_arguments(parser: OneLineParser, *, joints: bool = True) -> None:

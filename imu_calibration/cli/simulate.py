@@ -28,12 +28,12 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--profile', metavar='NAME', default='calibration', help='motion, default calibration; an unknown name lists all')
     common('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
     common('--seed', type=int, default=0, help='seed of noise and motion, default 0')
-    expert('--imu-seed', type=int, help='seed of the IMU itself, default the same: two sessions of one IMU share it')
+    expert('--imu-seed', metavar='SEED', type=int, help='seed of the IMU itself, default the same: two sessions of one IMU share it')
     common('--duration', type=float, help='wanted length, s')
-    expert('--imu-rate', type=float, default=100.0, help='Hz, default 100')
-    expert('--joint-rate', type=float, default=100.0, help='Hz, default 100')
-    expert('--encoder-resolution-deg', type=float, default=0.0, help='step of the joint positions, deg, default none')
-    expert('--stamp-jitter-us', type=float, default=0.0,
+    expert('--imu-rate', metavar='HZ', type=float, default=100.0, help='Hz, default 100')
+    expert('--joint-rate', metavar='HZ', type=float, default=100.0, help='Hz, default 100')
+    expert('--encoder-resolution-deg', metavar='DEG', type=float, default=0.0, help='step of the joint positions, deg, default none')
+    expert('--stamp-jitter-us', metavar='US', type=float, default=0.0,
            help='standard deviation of the IMU stamps, microseconds, default none')
     expert('--temperature', action='store_true', help='publish a temperature that warms up from 25 C')
     add_stand_arguments(parser, 'default a three-axis table')

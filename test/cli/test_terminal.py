@@ -138,6 +138,13 @@ def on_terminal(arguments, *, errors=False, code=0, **environment):
 
 
 @pytest.mark.live
+@pytest.mark.parametrize('verb', parser.VERBS)
+def test_help_is_shorter_than_60_lines_on_a_terminal(verb):
+    """Description and examples are folded there."""
+    assert len(on_terminal([verb, '--help']).splitlines()) < 60
+
+
+@pytest.mark.live
 @pytest.mark.parametrize('arguments', [['compensate', '--help'], ['convert', '--help'], ['effects'], ['inspect', SESSION], ['export', '--list']])
 def test_no_line_is_wider_than_the_terminal(arguments):
     """The terminal itself would break them within a word: help up to 138 columns, equations, names of parameters."""
