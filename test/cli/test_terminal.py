@@ -167,14 +167,24 @@ def test_colour_is_for_terminals_and_not_with_no_color():
     assert b'\x1b' not in plain.stdout + plain.stderr
 
 
-@pytest.mark.live
-@pytest.mark.parametrize('module', ['imu_calibration.cli.main', 'imu_calibration.cli.parser', 'numpy', 'datetime', 'scipy'])
-def test_an_early_interruption_ends_with_130_in_one_line(module):
-    """The signal arrives while a module is imported; numpy turned it into a broken installation where it imports `datetime`."""
+def interrupted_at(module, *arguments):
+    """Run a verb that gets SIGINT while it imports a module."""
     program = ('import os, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n'   # a background job ignores it
                f'class Watch:\n    def find_spec(self, name, path=None, target=None):\n        if name == {module!r}:\n'
                '            sys.meta_path.remove(self)\n            os.kill(os.getpid(), signal.SIGINT)\n'
                'sys.meta_path.insert(0, Watch())\n'
                'from imu_calibration.__main__ import main\nsys.exit(main())\n')
-    done = subprocess.run([sys.executable, '-c', program, 'inspect', SESSION], cwd=ROOT, capture_output=True, text=True)
+    return subprocess.run([sys.executable, '-c', program, *arguments], cwd=ROOT, capture_output=True, text=True)
+
+
+@pytest.mark.live
+@pytest.mark.parametrize('module', ['imu_calibration.cli.main', 'imu_calibration.cli.parser', 'numpy', 'datetime', 'scipy'])
+def test_an_early_interruption_ends_with_130_in_one_line(module):
+    """The signal arrives while a module is imported; numpy turned it into a broken installation where it imports `datetime`."""
+    done = interrupted_at(module, 'inspect', SESSION)
     assert done.returncode == 130 and done.stderr.count('\n') == 1 and 'Traceback' not in done.stderr, done.stderr
+
+
+@pytest.mark.live
+def test_a_postponed_interruption_does_not_kill_a_command_that_has_ended():
+    assert interrupted_at('imu_calibration.cli.parser', '--version').returncode in (0, 130)
