@@ -1,6 +1,7 @@
 """Message definitions: the standard ones, and whether a bag's own definition is the standard one."""
 
 from collections.abc import Callable
+from functools import cache
 from itertools import count
 from typing import NamedTuple
 
@@ -12,31 +13,7 @@ MAX_DEFINITION_CHARACTERS, MAX_ELEMENTS = 100_000, 10_000
 """Characters of a definition and elements of a message at most, an array counted by its elements."""
 DEFAULT_TOPICS = {IMU_TYPE: '/imu/data_raw', JOINT_STATE_TYPE: '/joint_states', TEMPERATURE_TYPE: '/imu/temperature'}
 
-_PARTS = {
-    'std_msgs/Header': 'builtin_interfaces/Time stamp\nstring frame_id\n',
-    'builtin_interfaces/Time': 'int32 sec\nuint32 nanosec\n',
-    'builtin_interfaces/Duration': 'int32 sec\nuint32 nanosec\n',
-    'trajectory_msgs/JointTrajectoryPoint': 'float64[] positions\nfloat64[] velocities\nfloat64[] accelerations\nfloat64[] effort\n'
-                                            'builtin_interfaces/Duration time_from_start\n',
-    'geometry_msgs/Quaternion': 'float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n',
-    'geometry_msgs/Vector3': 'float64 x\nfloat64 y\nfloat64 z\n',
-}
-_HEADER = ('std_msgs/Header', 'builtin_interfaces/Time')
-_STANDARD = {
-    IMU_TYPE: ('std_msgs/Header header\n'
-               'geometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n'
-               'geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n'
-               'geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance\n',
-               (*_HEADER, 'geometry_msgs/Quaternion', 'geometry_msgs/Vector3'),
-               'RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b'),
-    JOINT_STATE_TYPE: ('std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n', _HEADER,
-                       'RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e'),
-    JOINT_TRAJECTORY_TYPE: ('std_msgs/Header header\nstring[] joint_names\ntrajectory_msgs/JointTrajectoryPoint[] points\n',
-                            (*_HEADER, 'trajectory_msgs/JointTrajectoryPoint', 'builtin_interfaces/Duration'),
-                            'RIHS01_179b33eba59d676f6d967ac71fe35e7ca2f64b2f3928f4a018cec115e213796e'),
-    TEMPERATURE_TYPE: ('std_msgs/Header header\nfloat64 temperature\nfloat64 variance\n', _HEADER,
-                       'RIHS01_72514a14126ab9f8a9abec974c78e5610a367b59db5da355ff1fb982d5bad4b8'),
-}
+STANDARD_TYPES = (IMU_TYPE, JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, TEMPERATURE_TYPE)
 
 
 class TypeDefinition(NamedTuple):
@@ -52,16 +29,17 @@ class TypeDefinition(NamedTuple):
     """RIHS01 hash; may be empty."""
 
 
+@cache
 def standard_definition(message_type: str) -> TypeDefinition:
-    """Return the TypeDefinition of a type that this package supports."""
-    text, parts, digest = _STANDARD[message_type]
-    nested = ''.join(f'{SEPARATOR}\nMSG: {part}\n{_PARTS[part]}' for part in parts)
-    return TypeDefinition(message_type, 'ros2msg', text + nested, digest)
+    """Return the TypeDefinition of a type that this package supports, as in ROS 2 Jazzy."""
+    from rosbags.typesys import Stores, get_typestore
+    store = get_typestore(Stores.ROS2_JAZZY)
+    return TypeDefinition(message_type, 'ros2msg', store.generate_msgdef(message_type, ros_version=2)[0], store.hash_rihs01(message_type))
 
 
 def is_standard_name(message_type: str) -> bool:
     """Return whether this package supports the type."""
-    return message_type in _STANDARD
+    return message_type in STANDARD_TYPES
 
 
 def is_standard(message_type: str, encoding: str, text: str) -> bool:

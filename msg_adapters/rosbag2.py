@@ -8,6 +8,8 @@ from pathlib import Path, PurePath
 from tempfile import mkdtemp
 from typing import Any
 
+from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
+
 from imu_calibration.core import documents
 from imu_calibration.core.documents import open_regular, parsed
 from imu_calibration.core.errors import InputError, shortened
@@ -16,12 +18,7 @@ from msg_adapters.layout import clean_name
 from msg_adapters.mcap_records import decompress_file, decompress_message
 from msg_adapters.storages import STORAGES, suffixes
 
-_NAMES = {
-    'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
-    'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
-    'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
-    'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown', 'best_available'),
-}
+QOS_POLICIES = {'history': QosHistory, 'reliability': QosReliability, 'durability': QosDurability, 'liveliness': QosLiveliness}
 
 
 def spelled_out(profiles: Sequence) -> list:
@@ -37,10 +34,9 @@ def spelled_out(profiles: Sequence) -> list:
 
 
 def _name(key, value):
-    names = _NAMES.get(key)
-    if names is None or not isinstance(value, int):
+    if key not in QOS_POLICIES or not isinstance(value, int):
         return value
-    return names[value] if 0 <= value < len(names) else 'unknown'
+    return next((policy.name.lower() for policy in QOS_POLICIES[key] if policy.value == value), 'unknown')
 
 
 COMPRESSED = ('.zstd', '.zst')
