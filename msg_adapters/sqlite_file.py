@@ -16,7 +16,6 @@ import numpy as np
 from msg_adapters.definitions import TypeDefinition
 from msg_adapters.layout import Packed, clean_name
 from msg_adapters.sqlite_pages import PageReader
-from msg_adapters.sqlite_rows import PAGE_SIZE, RowWriter
 from msg_adapters.storage import StorageFile, Stretch, read_ahead
 
 MESSAGE_COLUMNS = ['id', 'topic_id', 'timestamp', 'data']
@@ -199,47 +198,37 @@ class SqliteWriter:
     """Writes one new file, which must not be opened elsewhere before `close`."""
 
     def __init__(self, path: Path, ros_distro: str):
-        self.path, self.topics = path, []
-        with closing(self._connect()) as connection:
-            for statement in SCHEMA_STATEMENTS:
-                connection.execute(statement)
-            connection.execute('INSERT INTO schema VALUES (4, ?)', (ros_distro,))
-            root = connection.execute("SELECT rootpage FROM sqlite_schema WHERE name = 'messages'").fetchone()[0]
-            connection.execute('COMMIT')
-        self.rows = RowWriter(path, root)
-
-    def _connect(self):
-        connection = sqlite3.connect(self.path, isolation_level=None)
+        self.connection = sqlite3.connect(path, isolation_level=None)
         # The file is made under another name and deleted on failure: a journal would have no benefit.
-        for pragma in (f'page_size = {PAGE_SIZE}', 'journal_mode = OFF', 'synchronous = OFF', 'locking_mode = EXCLUSIVE',
-                       'cache_size = -16000'):
-            connection.execute('PRAGMA ' + pragma)
-        connection.execute('BEGIN')
-        return connection
+        for pragma in ('journal_mode = OFF', 'synchronous = OFF', 'locking_mode = EXCLUSIVE', 'cache_size = -16000'):
+            self.connection.execute('PRAGMA ' + pragma)
+        self.connection.execute('BEGIN')
+        for statement in SCHEMA_STATEMENTS:
+            self.connection.execute(statement)
+        self.connection.execute('INSERT INTO schema VALUES (4, ?)', (ros_distro,))
 
     def add_topic(self, topic_id: int, name: str, definition: TypeDefinition, *, qos: str) -> None:
         """Declare a topic; `definition` is a TypeDefinition."""
-        self.topics.append((topic_id, name, definition, qos))
+        self.connection.execute('INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)',
+                                (topic_id, name, definition.type, 'cdr', qos, definition.digest))
+        known = self.connection.execute('SELECT 1 FROM message_definitions WHERE topic_type = ?', (definition.type,)).fetchone()
+        if not known and definition.text:
+            self.connection.execute(
+                'INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash) '
+                'VALUES (?, ?, ?, ?)', (definition.type, definition.encoding, definition.text, definition.digest))
 
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
-        self.rows.write(topic_ids, received_ns, messages)
+        self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)',
+                                    zip(topic_ids.tolist(), received_ns.tolist(), messages.views(), strict=True))
 
     def close(self, metadata_version: int, metadata: str) -> None:
-        """Add the topics, the index by time and the metadata, and close."""
-        self.rows.close()
-        with closing(self._connect()) as connection:
-            for topic_id, name, definition, qos in self.topics:
-                connection.execute('INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)',
-                                   (topic_id, name, definition.type, 'cdr', qos, definition.digest))
-            for each in {definition.type: definition for _, _, definition, _ in reversed(self.topics) if definition.text}.values():
-                connection.execute(
-                    'INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash) '
-                    'VALUES (?, ?, ?, ?)', (each.type, each.encoding, each.text, each.digest))
-            connection.execute('CREATE INDEX timestamp_idx ON messages (timestamp ASC)')
-            connection.execute('INSERT INTO metadata (metadata_version, metadata) VALUES (?, ?)', (metadata_version, metadata))
-            connection.execute('COMMIT')
+        """Add the index by time and the metadata, and close."""
+        self.connection.execute('CREATE INDEX timestamp_idx ON messages (timestamp ASC)')
+        self.connection.execute('INSERT INTO metadata (metadata_version, metadata) VALUES (?, ?)', (metadata_version, metadata))
+        self.connection.execute('COMMIT')
+        self.connection.close()
 
     def abort(self) -> None:
         """Close without finishing."""
-        self.rows.abort()
+        self.connection.close()
