@@ -8,6 +8,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
 from functools import partial
 from hashlib import sha256
+from multiprocessing import resource_tracker
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -132,24 +133,19 @@ def process_mapper(jobs: int, done: Callable = lambda item: None) -> Callable:
             return [_told(function(item), done) for item in items]
         # Spawned, not forked: a fork of a process with threads can stop for ever.
         with ProcessPoolExecutor(min(jobs, len(items)), mp_context=multiprocessing.get_context('spawn')) as pool:
-            with _interruptions_ignored():
-                futures = [pool.submit(_until_sigterm, function, item) for item in items]
-            return _in_order(futures, as_completed, done, pool)
+            return _in_order(pool, function, items, done)
     return mapped
 
 
 @contextmanager
-def _interruptions_ignored():
-    """Ctrl+C reaches all processes of a terminal; those started here ignore it: this one interrupts and ends them."""
-    try:
-        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except ValueError:   # not in the main thread
-        yield
-        return
+def _interruptions_blocked():
+    """Ctrl+C reaches all processes of a terminal; those that are started here never receive it: this one interrupts and ends them."""
+    resource_tracker.ensure_running()   # its start would end the block
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _until_sigterm(function, item):
@@ -166,8 +162,10 @@ def _told(result, done):
     return result
 
 
-def _in_order(futures, as_completed, done, pool):
+def _in_order(pool, function, items, done):
     try:
+        with _interruptions_blocked():
+            futures = [pool.submit(_until_sigterm, function, item) for item in items]
         for future in as_completed(futures):
             done(future.result())
     except BaseException:

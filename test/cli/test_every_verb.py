@@ -105,6 +105,15 @@ def test_verbose_prints_each_phase_with_its_time(capsys):
     assert 'reading sample_session: ' in capsys.readouterr().err and quiet.err == ''
 
 
+@pytest.mark.parametrize(('arguments', 'phases'), [(['simulate', '--profile', 'six_faces'], ['simulating', 'writing output']),
+                                                   (['plan', '--by-hand'], ['drawing the report'])])
+def test_verbs_without_a_recording_name_their_phases_too(arguments, phases, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main([*arguments, '--output', 'output', '--verbose']) == 0
+    names = [line.partition(': ')[0] for line in capsys.readouterr().err.splitlines()]
+    assert [phase for phase in phases if phase not in names] == []
+
+
 def test_a_listener_gets_each_step_and_only_in_its_context():
     seen = []
     with listening(lambda *step: seen.append(step)):

@@ -5,12 +5,15 @@ import io
 import os
 import pty
 import re
+import shutil
+import signal
 import struct
 import subprocess
 import sys
 import termios
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -165,6 +168,28 @@ def test_colour_is_for_terminals_and_not_with_no_color():
     assert b'\x1b[3' not in on_terminal(['inspect', SESSION], NO_COLOR='1')
     plain = subprocess.run([sys.executable, '-m', 'imu_calibration', 'inspect', SESSION], cwd=ROOT, capture_output=True, check=True)
     assert b'\x1b' not in plain.stdout + plain.stderr
+
+
+def children_of(process):
+    """Return the numbers of the processes that the main thread of a process started."""
+    return Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
+
+
+@pytest.mark.live
+def test_an_interruption_ends_worker_processes_without_tracebacks(tmp_path):
+    """Ctrl+C reaches all processes of a terminal; workers printed theirs, and the verb ended with 1."""
+    for name in ('first', 'second'):
+        shutil.copytree(SESSION, tmp_path / 'units' / name)
+    program = ('import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n'   # a background job ignores it
+               'from imu_calibration.__main__ import main\nif __name__ == "__main__":\n    sys.exit(main())\n')
+    process = subprocess.Popen([sys.executable, '-c', program, 'fleet', str(tmp_path / 'units'), '--table', TABLE, '--jobs', '2',
+                                '--output', str(tmp_path / 'never')], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    end = time.monotonic() + 60.0
+    while len(children_of(process)) < 3 and time.monotonic() < end:   # two workers and the tracker of resources
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    error = process.communicate(timeout=60)[1]
+    assert process.returncode == 130 and error.count('\n') == 1 and not (tmp_path / 'never').exists(), error
 
 
 def interrupted_at(module, *arguments):
