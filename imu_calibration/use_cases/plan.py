@@ -145,6 +145,7 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
         When the joints cannot move, or names do not match.
 
     """
+    report('planning')
     table, options = table_of(stand, gravity=choices.get('gravity')), calibration_options(choices)
     noise = expected_noise(options.noise, grade, imu_rate)
     limits, start = limits_of(table), None
@@ -244,6 +245,7 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
     accelerometer, gyroscope = (parse_effects(sensor, asked[sensor] or '+'.join(BASE), catalogue=options.catalogue) for sensor in SENSORS)
     model = HandModel(SensorModel(accelerometer, gyroscope, catalogue=options.catalogue), options.gravity or STANDARD_GRAVITY)
     noise = expected_noise(options.noise, grade, imu_rate)
+    report('planning')
     found = plan_by_hand(model, tolerances=tolerances_of(model.model, options.tolerances), noise=noise, rate=imu_rate)
     return PlannedByHand(found, model, {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
                                          'reference': 'gravity, by hand'})
