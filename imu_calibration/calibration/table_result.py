@@ -120,7 +120,8 @@ def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.n
     right = np.zeros((len(changes), len(pieces), len(solution.values)))
     for sensor in SENSORS:
         design = np.array([piece.mean[sensor] for piece in pieces])
-        weighted = _whitening(solution.noise[sensor], pieces).weigh(design)
+        whitening = _whitening(solution.noise[sensor], pieces)
+        weighted = whitening.adjoint(whitening(design))
         for axis in range(3):
             normal = normal + weighted[:, axis].T @ design[:, axis]
             for k, piece in enumerate(pieces):

@@ -149,10 +149,11 @@ class WeightedSystem:
         total = np.zeros((len(values),) * 2)
         for sensor in SENSORS:
             slope, whitening = coefficient_jacobian(self.model, sensor, values), self._whitening(noises[sensor])
-            design = np.einsum('kp,paq->kaq', self.means[sensor][:, :-3], slope)
-            white, weighed = whitening(design), whitening.weigh(design)
+            white = whitening(np.einsum('kp,paq->kaq', self.means[sensor][:, :-3], slope))
+            information = np.einsum('kap,kaq->pq', white, white)
+            weighed = whitening.adjoint(white)
             apart = weighed * self.mean_variance(noises[sensor], beside_bias=False)[:, :, None]
-            total += np.einsum('kap,kaq->pq', white, white) - np.einsum('kap,kaq->pq', weighed, apart)
+            total += information - np.einsum('kap,kaq->pq', weighed, apart)
         return total
 
     def whitened_means(self, sensor: str, noise: NoiseModel) -> np.ndarray:

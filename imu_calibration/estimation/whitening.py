@@ -47,9 +47,9 @@ class Whitening:
         """Return the whitened rows of `values`, both shape (n, n_axes, q)."""
         return self._with_session_offsets(self._filtered(values))
 
-    def weigh(self, values: np.ndarray) -> np.ndarray:
-        """Return ``V^-1 values`` with V the covariance, both shape (n, n_axes, q)."""
-        return self._filtered(self._with_session_offsets(self(values)), 'adjoint')
+    def adjoint(self, white: np.ndarray) -> np.ndarray:
+        """Return ``W' white``, shape (n, n_axes, q), of rows whitened by W, which it overwrites: ``V^-1 values`` with V the covariance."""
+        return self._filtered(self._with_session_offsets(white), 'adjoint')
 
     @property
     def log_determinant(self) -> float:
@@ -66,8 +66,8 @@ class Whitening:
     def _filtered(self, values, direction='forward'):
         if self._filter is None:
             return values / np.sqrt(self._variance)[:, :, None]
-        white = np.empty_like(values)
         found = getattr(self._filter, direction)(self._chained(values))
+        white = np.empty_like(values)
         white[self._order] = found.reshape(values.shape[1], -1, values.shape[2]).transpose(1, 0, 2)
         return white
 
@@ -82,7 +82,7 @@ class Whitening:
 
 
 class _Filter:
-    """Innovations over their standard deviations of one chain of rows; an infinite step begins a new series."""
+    """Innovations over their standard deviations of one chain of rows, in place; an infinite step begins a new series."""
 
     def __init__(self, variance, steps, processes):
         power, times = np.array([(process.sd**2, process.time) for process in processes]).T
@@ -102,13 +102,15 @@ class _Filter:
             driven = np.asfortranarray((self._driven_by[:, :, None] * values[:-1, None, :]).reshape(-1, values.shape[1]))
             states = lapack.dtbtrs(self._bands, driven, uplo='L', diag='U', overwrite_b=1)[0]
             values[1:] -= states if self._width == 1 else states.reshape(len(values) - 1, self._width, -1).sum(axis=1)
-        return values / np.sqrt(self.total)[:, None]
+        values /= np.sqrt(self.total)[:, None]
+        return values
 
-    def adjoint(self, white):
-        values = white / np.sqrt(self.total)[:, None]
+    def adjoint(self, values):
+        values /= np.sqrt(self.total)[:, None]
         if len(values) > 1:
             states = np.asfortranarray(np.repeat(values[1:], self._width, axis=0))
-            driven = lapack.dtbtrs(self._bands, states, uplo='L', trans='T', diag='U')[0].reshape(len(values) - 1, self._width, -1)
+            driven = lapack.dtbtrs(self._bands, states, uplo='L', trans='T', diag='U', overwrite_b=1)[0]
+            driven = driven.reshape(len(values) - 1, self._width, -1)
             values[:-1] -= np.einsum('kj,kjq->kq', self._driven_by, driven)
         return values
 

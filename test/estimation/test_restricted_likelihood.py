@@ -62,9 +62,10 @@ def test_a_row_is_whitened_with_earlier_rows_only(rows, processes):
     assert np.all(np.abs(whitening(spoilt)[12:] - whitening(values)[12:]).max(axis=(1, 2)) > 1.0)
 
 
-def test_weighing_is_the_inverse_covariance_itself(rows, processes):
+def test_whitening_and_its_adjoint_are_the_inverse_covariance(rows, processes):
     values, times, variance, sessions = rows
-    found = Whitening(variance, times, sessions, processes=processes, session_variance=STEP**2).weigh(values)
+    whitening = Whitening(variance, times, sessions, processes=processes, session_variance=STEP**2)
+    found = whitening.adjoint(whitening(values))
     for axis, covariance in enumerate(dense(times, variance, sessions, processes)):
         np.testing.assert_allclose(found[:, axis], np.linalg.solve(covariance, values[:, axis]), rtol=1e-9, atol=1e-11)
 
