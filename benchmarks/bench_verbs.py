@@ -75,7 +75,7 @@ def bench_verbs(repetitions=REPETITIONS, only=''):
             bag = write_bench_bag(Path(folder, f'bag{number}'), session=session.make())
             limit = 1 / (SECONDS_PER_MESSAGE * session.messages)
             for case in cases:
-                runs = [_measure(case, bag, Path(folder, f'{case.verb}_{k}')) for k in range(repetitions)]
+                runs = [_measure(case, bag, Path(folder, f'{case.verb}{number}_{k}')) for k in range(repetitions)]
                 yield case, [run[1] / run[0] for run in runs], [run[1] for run in runs], [run[2] for run in runs], limit * case.seconds
 
 

@@ -194,13 +194,18 @@ SCHEMA_STATEMENTS = (
 )
 
 
+PAGE_SIZE = 16384
+"""Bytes; SQLite writes and balances fewer pages than with its default of 4096."""
+
+
 class SqliteWriter:
     """Writes one new file, which must not be opened elsewhere before `close`."""
 
     def __init__(self, path: Path, ros_distro: str):
         self.connection = sqlite3.connect(path, isolation_level=None)
         # The file is made under another name and deleted on failure: a journal would have no benefit.
-        for pragma in ('journal_mode = OFF', 'synchronous = OFF', 'locking_mode = EXCLUSIVE', 'cache_size = -16000'):
+        for pragma in (f'page_size = {PAGE_SIZE}', 'journal_mode = OFF', 'synchronous = OFF', 'locking_mode = EXCLUSIVE',
+                       'cache_size = -16000'):
             self.connection.execute('PRAGMA ' + pragma)
         self.connection.execute('BEGIN')
         for statement in SCHEMA_STATEMENTS:
@@ -219,8 +224,10 @@ class SqliteWriter:
 
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
+        data = messages.buffer.tobytes()   # slices of bytes are made and bound in less time than memoryviews
+        rows = [data[start:stop] for start, stop in zip(messages.start.tolist(), (messages.start + messages.size).tolist(), strict=True)]
         self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)',
-                                    zip(topic_ids.tolist(), received_ns.tolist(), messages.views(), strict=True))
+                                    zip(topic_ids.tolist(), received_ns.tolist(), rows, strict=True))
 
     def close(self, metadata_version: int, metadata: str) -> None:
         """Add the index by time and the metadata, and close."""
