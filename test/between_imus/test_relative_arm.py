@@ -116,6 +116,7 @@ def test_clipping_needs_the_same_extreme_again_and_again():
     np.testing.assert_array_equal(clipped(values), np.any(values == 1.5, axis=1))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_sd_are_honest():
     """z scores of 40 seeds x 3 axes: their mean square scatters by 0.13 around 1, more for the 15 stretches that each sd comes from."""

@@ -103,6 +103,7 @@ def by_the_picture(person, most=40):
     return planned, shown
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_who_follows_only_the_picture_has_everything_determined_in_time():
     ratios = []

@@ -37,6 +37,7 @@ def question():
     return question_about(live)
 
 
+@pytest.mark.long
 def test_peak_of_a_live_diagnosis(question):
     windows = question.snapshot.gathered.spreads[0].windows
     assert sum(map(len, windows)) <= MAX_LIVE_SAMPLES

@@ -55,6 +55,7 @@ def peak(imu, joints, repetitions):
         tracemalloc.stop()
 
 
+@pytest.mark.long
 def test_peak_memory_does_not_grow_with_the_stream(piece, monkeypatch):
     """Three times the length takes no more memory, once all that is kept on purpose is full; nothing of the data is lost by it."""
     for module, name, value in ((gathering, 'KEPT_POSES', 20), (gathering, 'KEPT_SAMPLES', 2000), (least_squares, 'MAX_MEAN_ROWS', 64),

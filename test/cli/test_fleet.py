@@ -62,6 +62,7 @@ def result(recordings, tmp_path_factory):
     return run_fleet(recordings[0], output, '--jobs', '1'), output
 
 
+@pytest.mark.long
 def test_a_fleet_goes_on_past_a_bad_bag(result, capsys):
     """Good units have results, the bad one has its reason in one line, and the exit code says that something is missing."""
     code, output = result

@@ -127,6 +127,7 @@ def test_check_says_which_sensor_it_helps(yaw, block):
     assert 'gyroscope' in first and 'accelerometer' not in first and any('gyroscope' in line and HELPS in line for line in lines)
 
 
+@pytest.mark.long
 @pytest.mark.real_data
 def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
     """A vertical shaft: the accelerometer, unproven at other attitudes, doubled its error with a free matrix and reduces it with a fixed one."""

@@ -235,6 +235,7 @@ def test_by_hand_the_steps_are_planned_in_words_and_pictures(capsys, tmp_path):
     assert all(motion['text'] in printed for motion in document['motions'])
 
 
+@pytest.mark.long
 def test_a_plan_does_what_the_mixed_design_of_the_papers_does_in_no_more_time():
     profile = make_profile('zhang_m')
     table = Table.from_mapping({**profile.table, 'joints': [{**joint, 'speed_deg_s': 200.0 * 1.03, 'acceleration_deg_s2': 1000.0}

@@ -180,6 +180,7 @@ def normalised_errors(seeds, **session):
     return np.array(found)
 
 
+@pytest.mark.long
 def test_nine_poses_are_widened_by_student_s_t():
     """
     Nine poses leave no degree of freedom for their scatter: the misfit of the turns is attributed to it, with the quantile of Student's t.

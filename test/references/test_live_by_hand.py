@@ -207,6 +207,7 @@ def test_a_broken_file_is_refused(broken):
         make_live(broken)
 
 
+@pytest.mark.long
 def test_a_night_on_the_desk_does_not_push_the_poses_out(session, expected):
     """Memory stays bounded; of the long rest the inside goes, and the answer is that of what is left."""
     rng = np.random.default_rng(6)

@@ -27,6 +27,7 @@ def test_a_gyroscope_whose_scale_walks_is_not_known_to_the_noise(seed):
     assert max(walking.sd_of(name) for name in MATRIX) > 10 * max(steady.sd_of(name) for name in MATRIX)
 
 
+@pytest.mark.long
 def test_clean_sessions_become_no_wider():
     grown = np.concatenate([errors('clean', seed, n_poses=16)[group][2] for seed in range(4) for group in GROUPS])
     assert np.quantile(grown, 0.95) < 1.3 and np.median(grown) == pytest.approx(1.0)

@@ -123,6 +123,7 @@ def test_ferraris_agrees_with_imucal(recordings):
     np.testing.assert_allclose(matrix, theirs.matrix, atol=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.real_data
 def test_ours_predicts_poses_left_out_no_worse_than_the_norm_fit(recordings):
