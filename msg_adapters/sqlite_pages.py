@@ -15,7 +15,8 @@ import numpy as np
 from imu_calibration.core.documents import open_regular
 
 INTERIOR, LEAF = 0x05, 0x0D
-STRETCH_PAGES = 1024
+PAGES_BYTES = 4 << 20
+"""Bytes of the pages that are read together."""
 MAX_DEPTH = 20
 """Of a b-tree by the file format's page numbers; deeper means a loop in a damaged file."""
 
@@ -66,6 +67,7 @@ class PageReader:
         size = int.from_bytes(header[16:18], 'big')
         self.page_size = 65536 if size == 1 else size
         self.usable = self.page_size - header[20]
+        self.stretch_pages = PAGES_BYTES // self.page_size
         self.n_pages = os.fstat(self.file.fileno()).st_size // self.page_size
         self.root = root
         self.damaged_pages, self.damaged_rows, self.last_id = 0, 0, None
@@ -82,14 +84,14 @@ class PageReader:
     def stretches(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield (buffer, starts of the pages in it) over the leaves."""
         if self.scanning:
-            for first in range(1, self.n_pages + 1, STRETCH_PAGES):
-                yield self._read(np.arange(first, min(first + STRETCH_PAGES, self.n_pages + 1)))
+            for first in range(1, self.n_pages + 1, self.stretch_pages):
+                yield self._read(np.arange(first, min(first + self.stretch_pages, self.n_pages + 1)))
             return
         waiting, n_waiting = [], 0
         for leaves in self._leaves():
             waiting.append(leaves)
             n_waiting += len(leaves)
-            if n_waiting >= STRETCH_PAGES:
+            if n_waiting >= self.stretch_pages:
                 yield self._read(np.concatenate(waiting))
                 waiting, n_waiting = [], 0
         if waiting:
