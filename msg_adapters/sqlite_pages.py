@@ -88,12 +88,13 @@ class PageReader:
                 yield self._read(np.arange(first, min(first + self.stretch_pages, self.n_pages + 1)))
             return
         waiting, n_waiting = [], 0
-        for leaves in self._leaves():
-            waiting.append(leaves)
-            n_waiting += len(leaves)
-            if n_waiting >= self.stretch_pages:
-                yield self._read(np.concatenate(waiting))
-                waiting, n_waiting = [], 0
+        for leaves in self._leaves():   # of one inner page: many where the pages are large
+            for some in np.split(leaves, range(self.stretch_pages, len(leaves), self.stretch_pages)):
+                waiting.append(some)
+                n_waiting += len(some)
+                if n_waiting >= self.stretch_pages:
+                    yield self._read(np.concatenate(waiting))
+                    waiting, n_waiting = [], 0
         if waiting:
             yield self._read(np.concatenate(waiting))
 
