@@ -184,6 +184,15 @@ def test_a_missing_or_broken_part_of_a_split_bag_costs_only_itself(bags, session
     assert sorted(reason.split(' that')[0] for reason in lost) == ['file broken_1.db3', 'file missing_0.db3']
 
 
+def test_a_receive_time_that_is_no_number_leaves_the_duration_unknown(bags, tmp_path):
+    shutil.copy(bags / 'sqlite3' / 'sqlite3_0.db3', tmp_path / 'bag.db3')
+    with sqlite3.connect(tmp_path / 'bag.db3') as connection:
+        connection.execute("UPDATE messages SET timestamp = 'x' WHERE id = 7")
+    connection.close()
+    with open_recording(tmp_path / 'bag.db3', want_joints='optional') as recording:
+        assert recording.duration == 0.0
+
+
 def test_rows_of_a_write_ahead_log_are_read(bags, session, tmp_path):
     """A recorder that was killed in its resilient mode leaves such a file."""
     folder = tmp_path / 'wal'
