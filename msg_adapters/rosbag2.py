@@ -8,8 +8,6 @@ from pathlib import Path, PurePath
 from tempfile import mkdtemp
 from typing import Any
 
-from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
-
 from imu_calibration.core import documents
 from imu_calibration.core.documents import open_regular, parsed
 from imu_calibration.core.errors import InputError, shortened
@@ -18,7 +16,7 @@ from msg_adapters.layout import clean_name
 from msg_adapters.mcap_records import decompress_file, decompress_message
 from msg_adapters.storages import STORAGES, suffixes
 
-QOS_POLICIES = {'history': QosHistory, 'reliability': QosReliability, 'durability': QosDurability, 'liveliness': QosLiveliness}
+QOS_POLICIES = ('history', 'reliability', 'durability', 'liveliness')
 
 
 def spelled_out(profiles: Sequence) -> list:
@@ -36,7 +34,8 @@ def spelled_out(profiles: Sequence) -> list:
 def _name(key, value):
     if key not in QOS_POLICIES or not isinstance(value, int):
         return value
-    return next((policy.name.lower() for policy in QOS_POLICIES[key] if policy.value == value), 'unknown')
+    from rosbags import interfaces
+    return next((policy.name.lower() for policy in getattr(interfaces, f'Qos{key.title()}') if policy.value == value), 'unknown')
 
 
 COMPRESSED = ('.zstd', '.zst')
