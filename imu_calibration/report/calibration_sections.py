@@ -228,7 +228,7 @@ class _Correlation:
         axes.grid(visible=False)
         for side in axes.spines.values():
             side.set_visible(False)
-        bar = figure.colorbar(image, ax=axes, shrink=0.6, pad=0.02, fraction=0.05)
+        bar = figure.colorbar(image, ax=axes, shrink=0.6, pad=0.02)
         bar.outline.set_visible(False)
 
 

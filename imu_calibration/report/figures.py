@@ -117,72 +117,25 @@ def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, 
     """
     import matplotlib
     from markupsafe import escape
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update({**STYLE, 'svg.hashsalt': name})
-        figure, text = Figure(figsize=size), io.StringIO()
+        figure = Figure(figsize=size, layout='constrained')
         paint(figure)
-        _place(figure)
-        FigureCanvasSVG(figure).print_svg(text, metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None})
+        canvas, text = _laid_out(figure), io.StringIO()
+        figure.dpi = matplotlib.rcParams['figure.dpi']   # of pictures inside, which the canvas lays out at 72
+        canvas.print_svg(text, metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None})
         return Drawn(_inside(text.getvalue(), str(escape(label))), figure)
 
 
-CHARACTER, LINE_HEIGHT = 0.58, 1.2
-"""Mean width and height of text in units of its font size."""
-PAD, TICK_PAD = 0.06, 0.1
-"""Distance of texts, and of tick labels from their axis, inches."""
-
-
-def _place(figure):
-    """
-    Place the axes side by side and one above the other, with margins from the numbers of characters of their labels.
-
-    The layout engines of matplotlib measure each text twice, a third of the processor time of a page.
-    """
-    grid = figure.axes[0].get_subplotspec().get_topmost_subplotspec().get_gridspec()
-    beside, above = np.zeros((2, grid.ncols)), np.zeros((2, grid.nrows))   # left and right of columns, top and bottom of rows, inches
-    for axes in figure.axes:
-        spec = axes.get_subplotspec().get_topmost_subplotspec()
-        across, (top, bottom) = _labels(axes)
-        beside[:, spec.colspan.start] = np.maximum(beside[:, spec.colspan.start], across)
-        above[:, spec.rowspan.start] = np.maximum(above[:, spec.rowspan.start], (top, bottom))
-    width, height = figure.get_size_inches()
-    (left, right), (top, bottom) = (beside[0, 0], beside[1, -1]), (above[0, 0], above[1, -1])
-    gaps = [(one[1:] + other[:-1]).max(initial=0.0) for one, other in (beside, above)]
-    sizes = [(full - sum(ends) - gap * (count - 1)) / count for full, ends, gap, count in (
-        (width, (left, right), gaps[0], grid.ncols), (height, (top, bottom), gaps[1], grid.nrows))]
-    figure.subplots_adjust(left=left / width, right=1 - right / width, top=1 - top / height, bottom=bottom / height,
-                           wspace=gaps[0] / sizes[0], hspace=gaps[1] / sizes[1])
-
-
-def _labels(axes):
-    """Return the inches that labels take at the (left, right) and (top, bottom) of axes."""
-    beside, below = (max((_extent(text)[k] + TICK_PAD for text in _tick_labels(axis)), default=0.0) if axes.axison else 0.0
-                     for k, axis in enumerate((axes.yaxis, axes.xaxis)))
-    label, under, title = (sum(_extent(text)[k] + PAD for text in some if text.get_text())
-                           for k, some in ((0, [axes.yaxis.label]), (1, [axes.xaxis.label]), (1, [axes.title, axes._left_title])))
-    above = [title, *(_extent(text)[1] for text in axes.texts if getattr(text, 'get_annotation_clip', bool)() is False)]
-    if (legend := axes.get_legend()) is not None:
-        anchor, line = legend.get_bbox_to_anchor(), 3 * TICK_PAD
-        above.append(line * (anchor.y0 >= axes.bbox.y1))
-        under += line * (anchor.y1 < axes.bbox.y0)
-    sides = (beside + label, 0.0) if axes.yaxis.get_label_position() == 'left' else (0.0, beside + label)
-    return np.add(sides, PAD), np.add((max(above), below + under), PAD)
-
-
-def _tick_labels(axis):
-    low, high = sorted(axis.get_view_interval())
-    return [text for place, text in zip(axis.get_majorticklocs(), axis.get_majorticklabels()) if low <= place <= high
-            and text.get_visible() and text.get_text()]
-
-
-def _extent(text):
-    """Return width and height of a rotated line of text, inches, from its number of characters."""
-    size, angle = text.get_fontsize() / 72, math.radians(text.get_rotation())
-    width, height = CHARACTER * size * len(text.get_text()), LINE_HEIGHT * size
-    return (width * abs(math.cos(angle)) + height * abs(math.sin(angle)), width * abs(math.sin(angle)) + height * abs(math.cos(angle)))
+def _laid_out(figure):
+    """Place the axes once and return the canvas; `savefig` would do it twice more, and draw once without need."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    canvas = FigureCanvasSVG(figure)
+    figure.get_layout_engine().execute(figure)
+    figure.set_layout_engine('none')
+    return canvas
 
 
 def _inside(svg, label):
