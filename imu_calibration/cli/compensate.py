@@ -3,7 +3,7 @@
 from argparse import Namespace
 
 from imu_calibration.cli.arguments import BAG, add_topic_arguments
-from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
+from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 
 EXAMPLES = ('drive --calibration result/calibration.yaml --output drive_corrected',
             'drive --calibration calibration.yaml --target-frame base_link --target-xyz 0.1 0 0.2 --output drive_corrected')
@@ -35,8 +35,8 @@ def run(options: Namespace) -> VerbResult:
              'temperature_topic', 'frame_id')
     found = compensate(options.bag, options.calibration, **{name: getattr(options, name) for name in names})
     for line in found.warnings:
-        print(folded(f'note: {line}'))
-    print(folded(f'written: {options.output} with {options.corrected_topic} ({found.count} samples)'))
+        print_line(f'note: {line}')
+    print_line(f'written: {options.output} with {options.corrected_topic} ({found.count} samples)')
     if found.lost:
         print('lost: ' + ', '.join(f'{count} {reason}' for reason, count in found.lost.items()))
     return VerbResult(found.exit_code, {'output': str(options.output), 'topic': options.corrected_topic, 'count': found.count,

@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
+from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 from msg_adapters.storages import identifiers
 
 EXAMPLES = ('log.csv --output session', 'log.csv --columns time=t:ms force=ax,ay,az:g rate=gx,gy,gz:deg/s --output session')
@@ -28,8 +28,8 @@ def run(options: Namespace) -> VerbResult:
     for columns in log.columns:
         print(columns)
     if log.unused:
-        print(folded(f'unused: {", ".join(log.unused)}'))
+        print_line(f'unused: {", ".join(log.unused)}')
     write_session(options.output, log.imu, log.joints, temperature=log.temperature, storage=options.storage)
-    print(folded(f'written: {options.output} ({len(log.imu)} Imu)'))
+    print_line(f'written: {options.output} ({len(log.imu)} Imu)')
     columns = [{'quantity': c.quantity, 'joint': c.joint, 'names': c.names, 'unit': c.unit, 'origin': c.origin} for c in log.columns]
     return VerbResult(0, {'output': str(options.output), 'count': len(log.imu), 'columns': columns, 'unused': log.unused})

@@ -3,7 +3,7 @@
 from argparse import Namespace
 
 from imu_calibration.cli.arguments import add_effects_argument
-from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
+from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 
 EXAMPLES = ('', '--effects my_effects.yaml --json')
 
@@ -18,9 +18,9 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.use_cases.choices import effect_rows
     rows = effect_rows(options.catalogue)
     for row in rows:
-        print(folded(f'{row["effect"]} ({row["sensor"]}, {row["unit"]}, tolerance {row["tolerance"]:g}, '
-                     f'compensation {row["compensation"]})', 4 * ' '))
+        print_line(f'{row["effect"]} ({row["sensor"]}, {row["unit"]}, tolerance {row["tolerance"]:g}, '
+                   f'compensation {row["compensation"]})', 4 * ' ')
         for label in ('text', 'equation', 'needs'):
             if row[label]:
-                print(folded(f'    {"" if label == "text" else label + ": "}{row[label]}', 8 * ' '))
+                print_line(f'    {"" if label == "text" else label + ": "}{row[label]}', 8 * ' ')
     return VerbResult(0, {'effects': rows})

@@ -3,7 +3,7 @@
 from argparse import Namespace
 
 from imu_calibration.cli.arguments import add_stand_arguments, add_topic_arguments, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
+from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 
 EXAMPLES = ('--list', 'result/calibration.yaml --to kalibr --noise noise/noise.yaml --output imu.yaml')
@@ -40,8 +40,8 @@ def run(options: Namespace) -> VerbResult:
     found = export_calibration(options.document, options.to, output=options.output, noise=options.noise, rate=options.rate,
                                bag=options.bag, stand=stand, topics=topics, anyway=options.anyway)
     for line in found.lines:
-        print(folded(line))
-    print(folded(f'written: {options.output}'))
+        print_line(line)
+    print_line(f'written: {options.output}')
     return VerbResult(found.exit_code, {'output': options.output, 'lines': found.lines})
 
 

@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
+from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 
 EXAMPLES = ('imu.yaml --from kalibr --output calibration.yaml', 'params.txt --from px4 --output calibration.yaml')
 
@@ -23,10 +23,10 @@ def run(options: Namespace) -> VerbResult:
     found = import_calibration(options.file, options.source, output=options.output, frame_id=options.frame_id)
     held = [name for name, status in found.requested.items() if status == HELD]
     for sensor, word in found.decisions.items():
-        print(folded(': '.join([f'{sensor} {word}', *filter(None, [found.decision_reasons.get(sensor)])])))
+        print_line(': '.join([f'{sensor} {word}', *filter(None, [found.decision_reasons.get(sensor)])]))
     for line in found.notes:
-        print(folded(line))
+        print_line(line)
     if held:
-        print(folded(f'not in the file, held at the prior: {", ".join(held)}'))
-    print(folded(f'written: {options.output}'))
+        print_line(f'not in the file, held at the prior: {", ".join(held)}')
+    print_line(f'written: {options.output}')
     return VerbResult(0, {'output': str(options.output), 'held': held})

@@ -4,7 +4,7 @@ from argparse import Namespace
 from itertools import groupby
 
 from imu_calibration.cli.arguments import add_topic_arguments
-from imu_calibration.cli.parser import OneLineParser, VerbResult, complain, folded
+from imu_calibration.cli.parser import OneLineParser, VerbResult, complain, print_line
 
 EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
 
@@ -48,5 +48,5 @@ def _show(found, rates, folder, names):
             print(f' {row.axis} {row.value:>8}  {row.interval:>17}  {row.status:<10}  {row.note}'.rstrip())
     print()
     for line in [*document.lines(found.figures), *document.filter_lines(found.figures, rates, found.horizon)]:
-        print(folded(line, '    '))
-    print(folded(f'written: {names} in {folder}'))
+        print_line(line, '    ')
+    print_line(f'written: {names} in {folder}')

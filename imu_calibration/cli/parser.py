@@ -71,8 +71,13 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def complain(text: str) -> None:
-    """Print a line on standard error."""
-    print(folded(text, stream=sys.stderr), file=sys.stderr)
+    """Print a line on standard error (`print_line`)."""
+    print_line(text, stream=sys.stderr)
+
+
+def print_line(text: str, indent: str = '', *, stream: TextIO | None = None) -> None:
+    """Print a line on `stream` (standard output), broken between words at the width of a terminal."""
+    print(folded(text, indent, stream=stream), file=stream or sys.stdout)
 
 
 def folded(text: str, indent: str = '', last: str = '', *, stream: TextIO | None = None) -> str:

@@ -3,7 +3,7 @@
 from argparse import Namespace
 
 from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
+from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
@@ -66,10 +66,10 @@ def _run_by_hand(options):
         made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **{name: getattr(options, name) for name in CHOICES})
         made.save(folder, report=not options.no_report)
     for number, step in enumerate(made.plan.steps, start=1):
-        print(folded(f'{number:3d}  {step.words}', '     '))
+        print_line(f'{number:3d}  {step.words}', '     ')
     for line in hand_summary(made.plan):
-        print(folded(line, '    '))
-    print(folded(f'written: plan.yaml in {folder}'))
+        print_line(line, '    ')
+    print_line(f'written: plan.yaml in {folder}')
     return VerbResult(made.exit_code, hand_plan_to_mapping(made.plan, made.provenance))
 
 
@@ -95,9 +95,9 @@ def _show(planned, folder):
     from imu_calibration.use_cases.plan import summary
     made = planned.plan
     for end, motion in list(zip(made.ends, made.motions, strict=True))[:MAX_PRINTED_MOTIONS]:
-        print(folded(f'until {end:6.1f} s  {motion.words}', ' ' * 16))
+        print_line(f'until {end:6.1f} s  {motion.words}', ' ' * 16)
     if len(made.motions) > MAX_PRINTED_MOTIONS:
         print(f'... and {len(made.motions) - MAX_PRINTED_MOTIONS} more, in plan.yaml')
     for line in [*summary(made), *planned.notes]:
-        print(folded(line, '    '))
-    print(folded(f'written: plan.yaml and the trajectory in {folder}'))
+        print_line(line, '    ')
+    print_line(f'written: plan.yaml and the trajectory in {folder}')

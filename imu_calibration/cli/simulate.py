@@ -3,7 +3,7 @@
 from argparse import Namespace
 
 from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, add_topic_arguments, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult, folded
+from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
@@ -56,8 +56,8 @@ def run(options: Namespace) -> VerbResult:
                       **{name: getattr(options, name) for name in ('imu_topic', 'joint_topic', 'temperature_topic')})
     made.save(options.output, storage=options.storage, compression=options.compression)
     samples = made.samples
-    print(folded(f'written: {options.output} ({made.duration:.0f} s, {len(samples.imu or ())} Imu, '
-                 f'{len(samples.joints or ())} JointState), with truth.yaml and table.yaml'
-                 + f'; {made.lost} samples without known joints left out' * bool(made.lost)))
+    print_line(f'written: {options.output} ({made.duration:.0f} s, {len(samples.imu or ())} Imu, '
+               f'{len(samples.joints or ())} JointState), with truth.yaml and table.yaml'
+               + f'; {made.lost} samples without known joints left out' * bool(made.lost))
     return VerbResult(0, {'output': str(options.output), 'seconds': made.duration, 'imu': len(samples.imu or ()),
                        'joints': len(samples.joints or ()), 'lost': made.lost})

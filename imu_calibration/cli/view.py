@@ -3,7 +3,7 @@
 from argparse import Namespace
 
 from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult, complain, folded
+from imu_calibration.cli.parser import OneLineParser, VerbResult, complain, print_line
 
 EXAMPLES = ('session --table table.yaml --output session.mcap', 'result --output parameters.mcap')
 
@@ -31,5 +31,5 @@ def run(options: Namespace) -> VerbResult:
     found.save(options.output)
     for line in found.lacks:
         complain(f'warning: {line}')
-    print(folded(f'written: {options.output}; open it in Foxglove with the layout {layout}'))
+    print_line(f'written: {options.output}; open it in Foxglove with the layout {layout}')
     return VerbResult(found.exit_code, {'output': str(options.output), 'layout': str(layout), 'lacks': found.lacks})
