@@ -87,16 +87,14 @@ class PageReader:
             for first in range(1, self.n_pages + 1, self.stretch_pages):
                 yield self._read(np.arange(first, min(first + self.stretch_pages, self.n_pages + 1)))
             return
-        waiting, n_waiting = [], 0
+        waiting = np.zeros(0, dtype=np.int64)
         for leaves in self._leaves():   # of one inner page: many where the pages are large
-            for some in np.split(leaves, range(self.stretch_pages, len(leaves), self.stretch_pages)):
-                waiting.append(some)
-                n_waiting += len(some)
-                if n_waiting >= self.stretch_pages:
-                    yield self._read(np.concatenate(waiting))
-                    waiting, n_waiting = [], 0
-        if waiting:
-            yield self._read(np.concatenate(waiting))
+            waiting = np.concatenate([waiting, leaves])
+            while len(waiting) >= self.stretch_pages:
+                yield self._read(waiting[:self.stretch_pages])
+                waiting = waiting[self.stretch_pages:]
+        if len(waiting):
+            yield self._read(waiting)
 
     def rows(self, buffer: np.ndarray, starts: np.ndarray) -> MessageRows:
         """Parse the leaves of a stretch; invalid pages and rows are counted and omitted."""
