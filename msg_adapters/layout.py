@@ -34,7 +34,13 @@ class Packed:
 
     def views(self) -> list[memoryview]:
         """Return the messages without copying them."""
-        data = self.buffer.data
+        return self._parts(self.buffer.data)
+
+    def copies(self) -> list[bytes]:
+        """Return the messages as bytes, with one copy of the buffer."""
+        return self._parts(self.buffer.tobytes())
+
+    def _parts(self, data):
         return [data[start:end] for start, end in zip(self.start.tolist(), (self.start + self.size).tolist(), strict=True)]
 
     def copy_to(self, target: np.ndarray, place: np.ndarray) -> None:

@@ -224,10 +224,8 @@ class SqliteWriter:
 
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
-        data = messages.buffer.tobytes()   # slices of bytes are made and bound in less time than memoryviews
-        rows = [data[start:stop] for start, stop in zip(messages.start.tolist(), (messages.start + messages.size).tolist(), strict=True)]
         self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)',
-                                    zip(topic_ids.tolist(), received_ns.tolist(), rows, strict=True))
+                                    zip(topic_ids.tolist(), received_ns.tolist(), messages.copies(), strict=True))   # bound faster than views
 
     def close(self, metadata_version: int, metadata: str) -> None:
         """Add the index by time and the metadata, and close."""
