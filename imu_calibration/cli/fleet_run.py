@@ -192,6 +192,6 @@ def summary_html(results: Sequence[UnitResult], spreads: Sequence[Spread]) -> st
     """Return the summary as one page."""
     verdicts = [result.verdict for result in results]
     word = HELPS if set(verdicts) == {HELPS} else UNPROVEN if set(verdicts) <= {HELPS, UNPROVEN} else HARMS
-    headline = f'the calibration helps both sensors of {verdicts.count(HELPS)} of {len(results)} units'
+    headline = f'The calibration helps both sensors of {verdicts.count(HELPS)} of {len(results)} units'
     return render('fleet.html', title='Calibration of a fleet', headline=headline, word=word, results=results, columns=SPREAD_HEADINGS,
                   rows=[shown(spread) for spread in spreads])
