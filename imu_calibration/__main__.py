@@ -11,10 +11,10 @@ RETRY_SECONDS, MOST_RETRIES = 0.02, 100
 
 class Interruption:
     """
-    Handler of signals: raises KeyboardInterrupt as soon as the running code does not swallow it.
+    Handler of signals: raises KeyboardInterrupt as soon as the running code passes it on.
 
-    It is postponed within an import, where numpy reports a broken installation, and at first within numpy and scipy, where finalizers
-    and compiled functions print the exception and continue.
+    It is postponed within an import, where numpy reports a broken installation instead, and, at most `MOST_RETRIES` times, within numpy
+    and scipy, where finalizers and compiled functions print the exception and continue.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,8 @@
 """
 Table leaves of an SQLite file, many pages at once.
 
-Only the file format's documented table b-tree is used (sqlite.org/fileformat2.html, sections 1.3 to 2.1). MessageRows that do not fit
-into one page are left to SQL; a damaged page costs its own rows only.
+Only the file format's documented table b-tree is used (sqlite.org/fileformat2.html, sections 1.3 to 2.1). Rows that do not fit
+into one page are read by SQL; a damaged page costs its own rows only.
 """
 
 import os
@@ -16,7 +16,7 @@ from imu_calibration.core.documents import open_regular
 
 INTERIOR, LEAF = 0x05, 0x0D
 PAGES_BYTES = 4 << 20
-"""Bytes of the pages that are read together."""
+"""Bytes of pages that are read in one stretch."""
 MAX_DEPTH = 20
 """Of a b-tree by the file format's page numbers; deeper means a loop in a damaged file."""
 
@@ -29,7 +29,7 @@ PADDING_BYTES = 64
 
 
 class MessageRows(NamedTuple):
-    """MessageRows of the table `messages`, in the order of their ids."""
+    """Rows of the table `messages`, in the order of their ids."""
 
     buffer: np.ndarray
     """Pages, uint8."""

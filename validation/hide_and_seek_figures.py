@@ -133,18 +133,18 @@ def _sentence(rows, parts):
 
 
 def missed(parts):
-    """Return what was not told rightly as a list: single effects, sessions that hide nothing, pairs, and pairs that were excepted."""
+    """Return the list of failures: single effects, sessions without an effect, pairs, and the excepted pairs."""
     lines = ['Single effects that were not named first:', '']
-    lines += [f'- {row["hidden"][0]}, {row["noise"]}, seed {row["seed"]}: {_told(row)}' for row in parts.get('effects', []) if not first_is_right(row)] or ['- none']
+    lines += [f'- {row["hidden"][0]}, {row["noise"]}, seed {row["seed"]}: {_outcome(row)}' for row in parts.get('effects', []) if not first_is_right(row)] or ['- none']
     lines += ['', 'Sessions without an effect, with a finding:', '']
-    lines += [f'- {row["noise"]}, seed {row["seed"]}: {_told(row)}' for row in parts.get('none', []) if row['found'] or row['unexplained'] or row['formulas']] or ['- none']
+    lines += [f'- {row["noise"]}, seed {row["seed"]}: {_outcome(row)}' for row in parts.get('none', []) if row['found'] or row['unexplained'] or row['formulas']] or ['- none']
     pairs = parts.get('pairs', [])
     lines += ['', 'Pairs without both names, or with a third:', '']
-    lines += [f'- {" + ".join(row["hidden"])}, seed {row["seed"]}: {_told(row)}' for row in pairs if separable(row) and (not both_found(row) or wrong_names(row))] or ['- none']
+    lines += [f'- {" + ".join(row["hidden"])}, seed {row["seed"]}: {_outcome(row)}' for row in pairs if separable(row) and (not both_found(row) or wrong_names(row))] or ['- none']
     excepted = sorted(' + '.join(row['hidden']) for row in pairs if not separable(row))
     return '\n'.join([*lines, '', f'Excepted pairs: {", ".join(excepted) or "none"}.'])
 
 
-def _told(row):
-    said = [' or '.join([name, *mates]) for name, mates in zip(row['found'], row['classes'])] or ['no cause named']
-    return ', '.join(said) + (', rest unexplained' if row['unexplained'] else '') + (f', formula {" and ".join(row["formulas"])}' if row['formulas'] else '')
+def _outcome(row):
+    names = [' or '.join([name, *mates]) for name, mates in zip(row['found'], row['classes'])] or ['no cause named']
+    return ', '.join(names) + (', rest unexplained' if row['unexplained'] else '') + (f', formula {" and ".join(row["formulas"])}' if row['formulas'] else '')

@@ -27,7 +27,7 @@ class ProgressBars:
 
     def __enter__(self):
         self._streams = sys.stdout, sys.stderr
-        sys.stdout, sys.stderr = (OtherText(stream, self) for stream in self._streams)
+        sys.stdout, sys.stderr = (BarFreeStream(stream, self) for stream in self._streams)
         return self
 
     def __exit__(self, *exception):
@@ -79,8 +79,8 @@ class ProgressBars:
         self._phase, self._since = phase, time.monotonic()
 
 
-class OtherText:
-    """A stream that removes the bar before it writes."""
+class BarFreeStream:
+    """A stream that removes the bar of progress before each text."""
 
     def __init__(self, stream: TextIO, bars: ProgressBars):
         self._stream, self._bars = stream, bars
@@ -89,7 +89,7 @@ class OtherText:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write below nothing else."""
+        """Remove the bar and write."""
         self._bars.remove()
         return self._stream.write(text)
 

@@ -139,7 +139,7 @@ def process_mapper(jobs: int, done: Callable = lambda item: None) -> Callable:
 
 @contextmanager
 def _interruptions_blocked():
-    """Ctrl+C reaches all processes of a terminal; those that are started here never receive it: this one interrupts and ends them."""
+    """Keep Ctrl+C, which a terminal sends to all its processes, from those that are started here; this process ends them."""
     resource_tracker.ensure_running()   # its start would end the block
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

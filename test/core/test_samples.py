@@ -18,6 +18,7 @@ def test_runs_are_all_that_is_true_and_apart(seed):
 def test_runs_reach_to_both_ends(flags, runs):
     assert runs_of(flags).tolist() == runs and runs_of(flags).shape == (len(runs), 2)
 
+
 def test_joined_parts_are_their_concatenation():
     """Parts of any length, also empty ones, while the arrays grow; they are not those of the first part."""
     rng = np.random.default_rng(0)
