@@ -37,7 +37,7 @@ class Packed:
         return self._parts(self.buffer.data)
 
     def copies(self) -> list[bytes]:
-        """Return the messages as bytes, with one copy of the buffer."""
+        """Return the messages as bytes, with one copy of the buffer; SQLite binds them in less time than views."""
         return self._parts(self.buffer.tobytes())
 
     def _parts(self, data):

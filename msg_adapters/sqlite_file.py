@@ -225,7 +225,7 @@ class SqliteWriter:
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
         self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)',
-                                    zip(topic_ids.tolist(), received_ns.tolist(), messages.copies(), strict=True))   # bound faster than views
+                                    zip(topic_ids.tolist(), received_ns.tolist(), messages.copies(), strict=True))
 
     def close(self, metadata_version: int, metadata: str) -> None:
         """Add the index by time and the metadata, and close."""
