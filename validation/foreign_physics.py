@@ -52,7 +52,7 @@ def outcome(kind, unit, motion, *, second=True):
     row['flagged'] = bool(row['findings'] if kind == 'nothing' else named) or any(rest.significant for rest in rests) or bool(found.onset)
     row['false_names'] = sorted(set(row['findings']) - world.names)
     row['formulas'] = [str(column) for rest in found.unexplained.values() if rest.proposal for column in rest.proposal.columns]
-    reported = {axis for rest in rests for axis in rest.axes}
+    reported = {axis for rest in rests for axis in rest.axes} | set(found.onset.axes if found.onset else ())
     row['axes'] = sorted(reported)
     row['axis'] = None if kind == 'nothing' or not world.axes else named or bool(reported) and reported <= world.axes
     regimes = [regime for rest in found.unexplained.values() for regime in rest.regimes[:3]]

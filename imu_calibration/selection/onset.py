@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.attempt import Attempt
@@ -14,6 +14,7 @@ from imu_calibration.selection.explained_share import MIN_EXPLAINED_SHARE, SIGNI
 from imu_calibration.selection.parameter_space import matrix_of_each
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_blocks import residuals
+from imu_calibration.selection.residual_fit import LEAST_OF_AXIS
 
 MIN_ONSET_WINDOWS = MIN_FOLD_WINDOWS + 1
 """Least number of moving windows before and after an onset: the longer part, without the window of the onset, can be searched."""
@@ -45,10 +46,12 @@ class Onset:
     """Parameter -> unit."""
     share: float
     """Share of the excess over noise that the second state removes."""
+    axes: tuple[str, ...] = ()
+    """Axes whose rows of the matrices change, the largest change first; empty for an effect of the reference."""
 
     def to_mapping(self) -> dict:
         """Return the onset as plain data."""
-        return {'time': self.time, 'time_sd': self.time_sd, 'what': self.what, 'share': self.share,
+        return {'time': self.time, 'time_sd': self.time_sd, 'what': self.what, 'share': self.share, 'axes': list(self.axes),
                 'parameters': {name: {'before': value, 'after': self.after[name], 'sd': self.sd[name], 'unit': self.units[name]}
                                for name, value in self.before.items()}}
 
@@ -98,15 +101,25 @@ def find_onset(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Q
     moment, moment_sd = _refined(windows, table, model, states=states, between=space.recording.time[ends])
     before, after = (dict(zip(names, state[group].tolist())) for state in states)
     return Onset(moment, moment_sd, name, before, after, dict(zip(names, sd.tolist())), {label: units[label] for label in names},
-                 1 - max(excess, 0.0) / single)
+                 1 - max(excess, 0.0) / single, () if name in _of_reference(model) else _axes_of(change, sd))
 
 
 def _groups(model):
     """Return name -> parameters of each group that may change suddenly."""
     numbers = np.arange(len(model.param_names))
     matrices = {sensor: numbers[model.part(sensor, Role.LINEAR)] for sensor in SENSORS}
-    of_reference = {effect.name: numbers[model.slices[effect.key]] for effect in model.effects if effect.sudden}
+    of_reference = {name: numbers[part] for name, part in _of_reference(model).items()}
     return {**of_reference, **matrices, ' and '.join(SENSORS): np.concatenate(list(matrices.values()))}
+
+
+def _of_reference(model):
+    return {effect.name: model.slices[effect.key] for effect in model.effects if effect.sudden}
+
+
+def _axes_of(change, sd):
+    """Return the axes with at least `LEAST_OF_AXIS` of the largest change of the rows of matrices, the largest first."""
+    squares = np.maximum(change**2 - sd**2, 0.0).reshape(-1, 3, 3).sum(axis=(0, 2))
+    return tuple(AXES[k] for k in np.argsort(-squares) if squares[k] > LEAST_OF_AXIS * squares.max())
 
 
 def _fit(total, own, small, changed=None):

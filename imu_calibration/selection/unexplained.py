@@ -21,6 +21,10 @@ WITHIN_SHARE = 0.02
 """Least excess of the variance within windows that counts."""
 ALPHA = 1e-4
 """Significance that a correlation must have."""
+IN_MOTION = 'motion (moving windows against windows at rest)'
+"""Name of the variable that separates moving windows from windows at rest."""
+MUCH_SCATTER = 10.0
+"""Least excess variance in motion, over the noise at rest and over the excess of the middle axis, of an axis with a cause of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +62,20 @@ def unexplained(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[
     excess, used = explained.excess(chosen), attempt.search.used(chosen)
     values = attempt.space.reduced(used, attempt.evidence.fit(used)[0])
     return {sensor: _rest(attempt, explained, sensor, excess[sensor], values) for sensor in SENSORS}
+
+
+def scatter_of_one_axis(attempt: Attempt, sensor: str) -> np.ndarray:
+    """
+    Return the excess variance of moving samples over the noise at rest of an axis that exceeds the others, shape (3,); otherwise 0.
+
+    Errors of the reference (encoder steps, jitter of the stamps) scatter all axes in motion, a cause in the sensor its own axis.
+    """
+    noise, recording = attempt.noise[sensor].at_rest_only(), attempt.recording
+    kinds, counts = recording.kind[recording.moving], recording.count[recording.moving]
+    if not len(kinds):
+        return np.zeros(3)
+    excess = np.maximum(np.average([noise.row_variance(kind) for kind in kinds], axis=0, weights=counts) - noise.low_variance, 0.0)
+    return np.where(excess > MUCH_SCATTER * np.maximum(np.median(excess), noise.low_variance), excess, 0.0)
 
 
 def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dict[str, float]]:
@@ -134,7 +152,7 @@ def _explanations(recording):
             angle, known = describe[name], describe['span' + number] < 0.7
             turns = np.stack([w(m * angle) for m in (1, 2, 3) for w in (np.cos, np.sin)], axis=1)
             yield f'angle of {recording.model.joint_names[int(number)]}', turns, known
-    yield 'motion (moving windows against windows at rest)', recording.moving[:, None].astype(float), every
+    yield IN_MOTION, recording.moving[:, None].astype(float), every
 
 
 def slow_explanations(time: np.ndarray, temperature: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:

@@ -26,11 +26,11 @@ def moment_of(recording, share):
     return share * max(window.time[-1] for window in recording.windows)
 
 
-@pytest.mark.parametrize('kind, what', [('axes', 'accelerometer'), ('mount', 'accelerometer and gyroscope'), ('belt', 'encoder_zero')])
-def test_a_change_at_one_moment_is_found_with_both_states(kind, what):
+@pytest.mark.parametrize('kind, what, axes', [('axes', 'accelerometer', 'xy'), ('mount', 'accelerometer and gyroscope', 'xyz'), ('belt', 'encoder_zero', '')])
+def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
     recording, found = investigated(Moment(kind))
     onset = found.onset
-    assert onset.what == what and onset.share > 0.95
+    assert onset.what == what and onset.share > 0.95 and set(onset.axes) == set(axes) == set(onset.to_mapping()['axes'])
     assert abs(onset.time - moment_of(recording, 0.55)) < 1.5 and onset.time_sd < 1.5
     changes = {name: onset.after[name] - value for name, value in onset.before.items()}
     if kind == 'axes':   # row x senses y; scale factors differ from one by less than a percent

@@ -5,14 +5,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.catalogue import term
 from imu_calibration.report.figures import draw_tones
 from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.spectrum import _without, find_tones, of_stretches
+from imu_calibration.selection.unexplained import IN_MOTION
 
 from worlds.hiding import record
 from worlds.physics_beyond import Machine
+from worlds.physics_cause import Cause
+from worlds.physics_draw import MG
 
 STEP = 0.01
 
@@ -69,3 +73,25 @@ def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():
     assert 'of the gyroscope' in drawn and 'mathdefault' not in drawn
     Rest.tones = ()
     assert draw_tones('gyroscope', Rest) == ''
+
+
+class Loud(Cause):
+    """A tone of 31 Hz in accelerometer z, and noise of gyroscope y in proportion to the rate: 0.5 at a rate of 1."""
+
+    def delivered(self, time, outputs, rate_s):
+        """Return both."""
+        tone = self.size * 20 * MG * np.sin(2 * np.pi * 31.0 * time)
+        noise = 0.5 * self.size * np.random.default_rng(1).normal(size=len(time)) * np.linalg.norm(rate_s, axis=1)
+        return [outputs[0] + np.outer(tone, [0, 0, 1]), outputs[1] + np.outer(noise, [0, 1, 0])]
+
+
+@pytest.mark.usefixtures('few_candidates')
+@pytest.mark.parametrize('size', [1.0, 0.0])
+def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size):
+    """Both are random to least squares, whose noise they increase: the diagnosis of either was "nothing found"."""
+    recording = record(5, None, 'realistic', through_bag=False, cause=Loud(size))
+    found = told(recording.table, investigate(recording.windows, recording.table, recording.model)).unexplained
+    assert [found[sensor].significant for sensor in ('accelerometer', 'gyroscope')] == [size > 0] * 2
+    if size:
+        assert [(rest.axes, rest.correlates_with) for rest in found.values()] == [(('z',), None), (('y',), IN_MOTION)]
+        assert found['accelerometer'].rms == pytest.approx(20 * MG / np.sqrt(6), rel=0.1)   # a mean over three axes, as of other residuals

@@ -11,7 +11,7 @@ from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Fi
 from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of_one_joint, sentence, separating_motion
 from imu_calibration.calibration.diagnosis.traces import residual_traces
 from imu_calibration.core.progress import report
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.table import Table
@@ -21,11 +21,13 @@ from imu_calibration.selection.gain import Gain, gain_in_turn
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.residual_analysis import Examination, inquire
 from imu_calibration.selection.spectrum import find_tones
-from imu_calibration.selection.unexplained import Unexplained
+from imu_calibration.selection.unexplained import IN_MOTION, Unexplained, scatter_of_one_axis
 
 MATE = 0.5
 """Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's reduction."""
 
+LOUD = 0.5
+"""Least mean square of a tone over the variance of the noise at rest, from which it is an unexplained residual."""
 HALF = 0.5
 """Share of a finding that an unnamed effect would replace, from which it is reported with the finding."""
 
@@ -144,4 +146,20 @@ def look_beyond(found: Examination) -> dict[str, Unexplained]:
         if (proposal is not None or first) and not rest.significant:
             sizes = proposal.sizes if proposal is not None else [regime.size * np.sqrt(regime.inside.mean()) for regime in first.values()]
             looked[sensor] = replace(looked[sensor], significant=True, rms=float(np.hypot.reduce(sizes)))
+        elif not rest.significant:
+            looked[sensor] = _beyond_noise(found, sensor, looked[sensor])
     return looked
+
+
+def _beyond_noise(found, sensor, rest):
+    """Return an insignificant rest as significant if loud tones or the scatter in motion of one axis exceed the noise at rest."""
+    scatter, noise = scatter_of_one_axis(found.attempt, sensor), found.attempt.noise[sensor].white_variance
+    squares = np.array(scatter)
+    for tone in rest.tones:
+        axis = AXES.index(tone.axis)
+        squares[axis] += 0.5 * tone.amplitude**2 if 0.5 * tone.amplitude**2 > LOUD * noise[axis] else 0.0
+    if not squares.any():
+        return rest
+    axes = tuple(AXES[k] for k in np.argsort(-squares) if squares[k])
+    return replace(rest, significant=True, rms=float(np.sqrt(squares.mean())), axes=axes,
+                   correlates_with=IN_MOTION if scatter.any() else None)
