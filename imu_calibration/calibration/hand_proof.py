@@ -8,7 +8,7 @@ import numpy as np
 from imu_calibration.calibration.proof import compared
 from imu_calibration.compensation.compensate import Corrected, compensate
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.trust import LAST_SHARE, Uncorrected, uncorrected_in_time
+from imu_calibration.document.trust import Uncorrected, judged_from_of, uncorrected_in_time
 from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular_of_band
 from imu_calibration.estimation.solution import HELD
@@ -37,7 +37,7 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
     Every eighth pose, with few attitudes one pose, is held out with the turns that begin or end there: one step from the solution without
     their rows. The error of the accelerometer is the length of its corrected reading in a pose less gravity; that of the
     gyroscope the angle between gravity rotated by its rates and gravity in the pose at the end of a turn. Readings are corrected as by
-    compensation; with effects in time the last third of the poses is evaluated. With too few poses or turns there is no entry.
+    compensation; with effects that settle the last third of the poses is evaluated. With too few poses or turns there is no entry.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
     """
     poses, model, uncorrected = hand.poses, hand.hand_model, uncorrected_by_hand(hand)
     plain = replace(model, gyro_factor=1.0).nominal
-    judged = poses.time >= (LAST_SHARE * end_by_hand(poses) if uncorrected.sizes else 0.0)
+    judged = poses.time >= judged_from_of(hand.model.at(hand.values), end_by_hand(poses))
     norms, angles = [], []
     for out, without in held_out_values(hand, turns):
         values, part = applied_values(model.model, without, uncorrected.centre), _selected(poses, out & judged)
@@ -105,7 +105,7 @@ def end_by_hand(poses: Poses) -> float:
 
 
 def uncorrected_by_hand(hand: HandCalibration) -> Uncorrected:
-    """Return the effects in time that compensation replaces by their value at the end of the recording."""
+    """Return the effects in time that compensation replaces by a constant."""
     return uncorrected_in_time(hand.model.at(hand.values), hand.values, hand.poses.time, end=end_by_hand(hand.poses))
 
 

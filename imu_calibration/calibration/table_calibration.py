@@ -110,7 +110,8 @@ def solve_in_passes(model: SensorModel, options: CalibrationOptions, solved: Cal
     for _ in range(MAX_TABLE_PASSES):
         model = again
         solution, gathered = solved(model, judged_from)
-        again, last_third = linearise_again(model, solution), judged_from_of(solution.model, end_of(gathered.accumulator))
+        again = linearise_again(model, solution)
+        last_third = judged_from_of(solution.model.at(solution.values), end_of(gathered.accumulator))
         if again is None and judged_from == last_third:
             break
         again, judged_from = again or model, last_third

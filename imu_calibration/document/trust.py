@@ -21,7 +21,9 @@ from imu_calibration.kinematics.rotations import Reference
 END, MEAN = 'end of the recording', 'mean of the recording'
 AGAIN = '; it is proven for its last third only, and the error returns where the effect starts again'
 LAST_SHARE = 2.0 / 3.0
-"""Effects in time are proven on the windows after this share of the recording: the value at its end is applied."""
+"""Effects that settle are proven on the windows after this share of the recording: the value at its end is applied."""
+SETTLED = 0.1
+"""An effect in time has settled if a recording of twice the length would change it by at most this share more: 2.3 time constants."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,18 +56,29 @@ def uncorrected_on_table(model: SensorModel, values: np.ndarray, accumulator: Ac
     """
     counts, end = np.array([row.count for row in accumulator.rows], float), end_of(accumulator)
     centre, sizes = {}, []
+    at_columns = replace(model, point=model.point | {e.name: gathered.point_of(e) for e in model.effects if e.time_constant})
     for effect in not_applied(model):
-        squares = np.zeros(3)
+        squares, at_end = np.zeros(3), settles(model, effect, end)
         for group in effect.groups:
             rows, own = gathered.layout(effect.sensor).rows[group.name], model.layout(effect.sensor).rows[group.name]
             means = np.array([row.sensors[effect.sensor].mean[rows] for row in accumulator.rows])
-            centre[group.name] = columns_at(model, effect, [end])[group.name][0] if in_time(effect) else counts @ means / counts.sum()
-            value = coefficients(model, effect.sensor, values)[own]
-            squares += counts @ ((means - centre[group.name]) @ value)**2
+            centre[group.name] = columns_at(model, effect, [end])[group.name][0] if at_end else _moved(
+                effect, counts @ means / counts.sum(), values[model.slices[effect.key]] - gathered.point_of(effect))
+            applied = centre[group.name] @ coefficients(model, effect.sensor, values)[own]
+            value = coefficients(at_columns, effect.sensor, values)[own]
+            squares += counts @ (means @ value - applied)**2
             for (sensor, _), factor in accumulator.within.items():
                 squares += ((factor[:, rows] @ value)**2).sum(axis=0) if sensor == effect.sensor else 0.0
-        sizes.append(_size(effect, np.sqrt(squares / counts.sum())))
+        sizes.append(_size(effect, np.sqrt(squares / counts.sum()), at_end))
     return Uncorrected(centre, tuple(sizes))
+
+
+def _moved(effect, columns, change):
+    """Return columns at parameters that differ by `change` from the point of the columns: of a time constant, to first order."""
+    if not effect.time_constant:
+        return columns
+    plain, slopes = np.split(columns, 2)
+    return np.concatenate([plain + change[-1] * slopes, slopes])
 
 
 def uncorrected_in_time(model: SensorModel, values: np.ndarray, times: Sequence[float] | np.ndarray, *,
@@ -73,11 +86,12 @@ def uncorrected_in_time(model: SensorModel, values: np.ndarray, times: Sequence[
     """Return the uncorrected part of effects in time at `times`, s, of a recording that ends at `end`."""
     centre, sizes = {}, []
     for effect in not_applied(model):
-        at_end, at_times = columns_at(model, effect, [end]), columns_at(model, effect, times)
-        centre |= {name: columns[0] for name, columns in at_end.items()}
+        at_end, at_times = settles(model, effect, end), columns_at(model, effect, times)
+        applied = columns_at(model, effect, [end]) if at_end else at_times
+        centre |= {name: columns.mean(axis=0) for name, columns in applied.items()}
         rows = model.layout(effect.sensor).rows
-        rest = sum((at_times[name] - centre[name]) @ coefficients(model, effect.sensor, values)[rows[name]] for name in at_end)
-        sizes.append(_size(effect, np.sqrt(np.mean(np.square(rest), axis=0))))
+        rest = sum((at_times[name] - centre[name]) @ coefficients(model, effect.sensor, values)[rows[name]] for name in at_times)
+        sizes.append(_size(effect, np.sqrt(np.mean(np.square(rest), axis=0)), at_end))
     return Uncorrected(centre, tuple(sizes))
 
 
@@ -87,8 +101,22 @@ def end_of(accumulator: Accumulator) -> float:
 
 
 def judged_from_of(model: SensorModel, end: float) -> float:
-    """Return the time from which windows are judged, s: the last third until `end` where the model has effects in time."""
-    return LAST_SHARE * end if any(map(in_time, not_applied(model))) else 0.0
+    """Return the time from which windows are judged, s: the last third until `end` where effects of the model settle."""
+    return LAST_SHARE * end if any(settles(model, effect, end) for effect in not_applied(model)) else 0.0
+
+
+def settles(model: SensorModel, effect: Effect, end: float) -> bool:
+    """
+    Return whether an effect in time has settled at the end of a recording, s, at the point of the model.
+
+    Then its value at the end is applied: it holds until the next start. Otherwise the mean is applied, with the least error in a recording
+    that repeats the drift; a drift that continues exceeds either.
+    """
+    if not in_time(effect):
+        return False
+    columns = [*columns_at(model, effect, [0.0, end, 2.0 * end]).values()]
+    start, at_end, later = np.split(columns[0], 2, axis=1)[0] if effect.time_constant else np.concatenate(columns, axis=1)
+    return bool(np.all(np.abs(later - at_end) <= SETTLED * np.abs(at_end - start)))
 
 
 def columns_at(model: SensorModel, effect: Effect, times: Sequence[float] | np.ndarray) -> dict[str, np.ndarray]:
@@ -98,8 +126,8 @@ def columns_at(model: SensorModel, effect: Effect, times: Sequence[float] | np.n
     return {group.name: group.columns(ref, model.full_point()) for group in effect.groups}
 
 
-def _size(effect, rms):
-    return {'effect': effect.name, 'sensor': effect.sensor, 'applied': END if in_time(effect) else MEAN, 'rms': rms.tolist(),
+def _size(effect, rms, at_end):
+    return {'effect': effect.name, 'sensor': effect.sensor, 'applied': END if at_end else MEAN, 'rms': rms.tolist(),
             'unit': UNITS[effect.sensor]}
 
 

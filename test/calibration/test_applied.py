@@ -113,6 +113,19 @@ def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third
     np.testing.assert_allclose(ref_start - ref_end, at_start - at_end, atol=0.1 * DEG)
 
 
+def test_a_drift_that_has_not_settled_is_applied_as_its_mean_and_proven_on_all_windows():
+    """Its value at the end holds neither afterwards nor in a session that repeats it."""
+    samples, table, at_end, at_start, duration = drifting(size=1.5 * DEG, time_constant=400.0)
+    calibration = imu.calibrate(samples, table).calibration
+    entry, = calibration.statistics['uncorrected']
+    assert (entry['effect'], entry['applied']) == ('gyro_bias_drift', MEAN)
+    course = -1.5 * DEG * np.expm1(-np.linspace(0.0, duration, 1000) / 400.0)
+    np.testing.assert_allclose(calibration.value('gyroscope', 'bias'), at_start + course.mean(), atol=0.03 * course[-1])
+    np.testing.assert_allclose(entry['rms'], course.std(), rtol=0.1)
+    assert calibration.proof['gyroscope']['windows'] > 0.5 * sum(calibration.statistics['windows'].values())
+    assert not any('starts again' in line for line in caveats(calibration))
+
+
 def model_output(calibration, time):
     """Return the output of the gyroscope of a calibration at rest at a time, rad/s, shape (3,)."""
     from imu_calibration.effects.forward_equations import sensor_output
