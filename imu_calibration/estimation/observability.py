@@ -213,16 +213,15 @@ def added_information(model: SensorModel, values: np.ndarray, noise: dict[str, N
     Each piece counts as one window at 100 Hz with the noise and the between-window scatter of this session.
     """
     total = np.zeros((len(values), len(values)))
+    slopes = {sensor: coefficient_jacobian(model, sensor, values) for sensor in SENSORS}
     for piece in motion.make(gravity):
         for sensor in SENSORS:
-            total += _piece_information(model, sensor, values, noise[sensor], piece)
+            total += _piece_information(model.layout(sensor), slopes[sensor], noise[sensor], piece)
     return total
 
 
-def _piece_information(model, sensor, values, noise, piece):
-    layout = model.layout(sensor)
+def _piece_information(layout, dc, noise, piece):
     design = np.concatenate([_columns(layout, name, rows, piece) for name, rows in layout.rows.items()], axis=1)
-    dc = coefficient_jacobian(model, sensor, values)
     static = len(piece) == 1
     count = 500.0 if static else 2.0 * len(piece)
     mean = design.mean(axis=0)

@@ -212,7 +212,7 @@ def _linearised(blocks, solution, prior):
 
 MAX_KEPT_SAMPLES = 100_000
 """Most samples kept of a recording."""
-MAX_LIVE_SAMPLES = 50_000
+MAX_LIVE_SAMPLES = 30_000
 """Most samples kept of a live session; a diagnosis needs about 1.5 kB of memory for each of them."""
 
 
