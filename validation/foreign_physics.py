@@ -24,7 +24,7 @@ from validation.section import markdown_table
 SAME_PLACE = 0.7
 """F1 score of the reported and the true samples from which a place counts as correct."""
 WORSE = 1.05
-"""Largest allowed ratio of the rms errors on a second session, chosen model over bias and matrix alone."""
+"""Largest allowed ratio of the rms errors on a second session, chosen model over bias and matrix only."""
 SENSORS = ('accelerometer', 'gyroscope')
 KINDS = ['clock_stepped' if kind == 'accel_offset_in_outer_arc' else kind for kind in PLACED] + list(UNPLACED)
 
@@ -79,11 +79,11 @@ def _place(world, regimes, onset=None):
 
 def _f1(time, options, world):
     true = np.interp(time, world.time, world.inside.astype(float)) > 0.5
-    return max(float(2 * (true & told).sum() / max(true.sum() + told.sum(), 1)) for told in options)
+    return max(float(2 * (true & reported).sum() / max(true.sum() + reported.sum(), 1)) for reported in options)
 
 
 def _second_session(block, table, kind, unit, motion):
-    """Return sensor -> rms error of a second session corrected by the chosen model over that by bias and matrix alone."""
+    """Return sensor -> rms error of a second session corrected by the chosen model over that by bias and matrix only."""
     plain = {'accelerometer_model': 'bias+matrix', 'gyroscope_model': 'bias+matrix', 'reference_model': 'none', 'model_as_asked': True}
     second = make_world(kind, unit, motion + 500_000)
     errors = []
@@ -103,19 +103,19 @@ def table_of(rows):
     placed = [row for row in hidden if row['kind'] not in UNPLACED]
     unplaced = [row for row in hidden if row['kind'] in UNPLACED]
     axes = [row['axis'] for row in hidden if row['axis'] is not None]
-    told = [row for row in hidden if row['place'] in ('correct', 'false')]
+    reported = [row for row in hidden if row['place'] in ('correct', 'false')]
     worst = [max(row['ratio'].values()) for row in hidden if row['ratio'] and 'refused' not in row['ratio']]
 
     def count(some, test):
         return f'{sum(map(bool, map(test, some)))} of {len(some)}'
     return markdown_table(('measure', 'target', 'measured'), [
-        ('flagged', '95 %', count(hidden, lambda row: row['flagged'])), ('right axis', '95 %', count(axes, bool)),
+        ('flagged', '95 %', count(hidden, lambda row: row['flagged'])), ('correct axis', '95 %', count(axes, bool)),
         ('place correct or cause named', '12 of 20', count(placed, lambda row: row['place'] in ('correct', 'named'))),
-        ('reported places that are correct', '85 %', count(told, lambda row: row['place'] == 'correct')),
-        ('false place where there is none', 'at most 2 of 20', count(unplaced, lambda row: row['place'] == 'false')),
+        ('reported places that are correct', '85 %', count(reported, lambda row: row['place'] == 'correct')),
+        ('false place in a recording without one', 'at most 2 of 20', count(unplaced, lambda row: row['place'] == 'false')),
         ('false name', 'at most 1 of 40', count(hidden, lambda row: row['false_names'])),
-        ('finding where nothing is hidden', '0 of 40', count(empty, lambda row: row['findings'])),
-        ('flagged where nothing is hidden', '', count(empty, lambda row: row['flagged'])),
+        ('finding without a cause', '0 of 40', count(empty, lambda row: row['findings'])),
+        ('flagged without a cause', '', count(empty, lambda row: row['flagged'])),
         ('second session worse than bias and matrix by more than 5 %', '0', count(worst, lambda ratio: ratio > WORSE)),
         ('refused with a reason', '', f"{count(hidden, lambda row: row['refused'])}, the second session {len(hidden) - len(worst)}"),
         ('processor time, median, 95 %, largest, s', '5 (95 %), 10', ', '.join(f'{q:.1f}' for q in np.quantile([row['seconds'] for row in rows], (0.5, 0.95, 1.0))))])
