@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.effects.base import AXES, SENSORS, Role
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.attempt import Attempt
@@ -14,7 +14,7 @@ from imu_calibration.selection.explained_share import MIN_EXPLAINED_SHARE, SIGNI
 from imu_calibration.selection.parameter_space import matrix_of_each
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_blocks import residuals
-from imu_calibration.selection.residual_fit import LEAST_OF_AXIS
+from imu_calibration.selection.residual_fit import largest_axes
 
 MIN_ONSET_WINDOWS = MIN_FOLD_WINDOWS + 1
 """Least number of moving windows before and after an onset: the longer part, without the window of the onset, can be searched."""
@@ -117,9 +117,8 @@ def _of_reference(model):
 
 
 def _axes_of(change, sd):
-    """Return the axes with at least `LEAST_OF_AXIS` of the largest change of the rows of matrices, the largest first."""
-    squares = np.maximum(change**2 - sd**2, 0.0).reshape(-1, 3, 3).sum(axis=(0, 2))
-    return tuple(AXES[k] for k in np.argsort(-squares) if squares[k] > LEAST_OF_AXIS * squares.max())
+    """Return the axes with the largest changes of the rows of matrices."""
+    return largest_axes(np.maximum(change**2 - sd**2, 0.0).reshape(-1, 3, 3).sum(axis=(0, 2)))
 
 
 def _fit(total, own, small, changed=None):

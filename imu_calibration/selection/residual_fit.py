@@ -18,6 +18,11 @@ ABOVE_NOISE = 3.0
 """Least excess of this axis over noise, standard deviations."""
 
 
+def largest_axes(squares: np.ndarray, least: float = LEAST_OF_AXIS) -> tuple[str, ...]:
+    """Return the axes whose squares, shape (3,), exceed the share `least` of the largest, the largest first."""
+    return tuple(AXES[k] for k in np.argsort(-squares) if squares[k] > least * squares.max())
+
+
 @dataclass(frozen=True, eq=False)
 class BlockFit:
     """A model and further columns, fitted to the selection windows."""
@@ -81,8 +86,7 @@ class BlockFits:
         excess = self._excess()
         noise = ABOVE_NOISE * np.sqrt(2.0 * (~self.blocks.locked).sum())
         squares = excess * np.median(self.blocks.variance[~self.blocks.locked], axis=0)
-        return tuple(AXES[k] for k in np.argsort(-squares)
-                     if squares[k] > LEAST_OF_AXIS * squares.max() and excess[k] > min(noise, 0.99 * excess.max()))
+        return tuple(axis for axis in largest_axes(squares) if excess[AXES.index(axis)] > min(noise, 0.99 * excess.max()))
 
     @property
     def sigma(self) -> float:

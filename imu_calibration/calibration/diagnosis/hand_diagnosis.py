@@ -18,7 +18,7 @@ from imu_calibration.references.gravity.model_selection import HandInvestigation
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regime_variables import Variable, ranged
 from imu_calibration.selection.regimes import REGIME_LEVEL, AxisResidual, RegimeSearch, RestRegime, exchanges
-from imu_calibration.selection.residual_fit import LEAST_OF_AXIS
+from imu_calibration.selection.residual_fit import largest_axes
 from imu_calibration.selection.unexplained import MIN_EXPLAINED_WINDOWS, SIGNIFICANT_SDS, Unexplained, correlate, slow_explanations
 
 NORM = 'norm'
@@ -120,9 +120,9 @@ def rest_of(hand: HandCalibration, inquiry: Any, named: Sequence[Question], *, s
         name = 'motion (turns between poses)'
     heldout = inquiry.evidence.heldout_residuals(used)[first]
     excess = ((heldout / noise_sd)**2 - 1.0).sum(axis=0)
-    axes = [AXES[k] for k in np.argsort(-excess) if excess[k] > LEAST_OF_AXIS * excess.max() > 0] if len(excess) == len(AXES) else []
+    axes = largest_axes(excess) if len(excess) == len(AXES) and excess.max() > 0 else ()
     return Unexplained(True, rms, float(sigma), name, share, layers, noise_sd, unit,
-                       tuple(axes), regimes_by_hand(hand, inquiry.blocks[first], heldout))
+                       axes, regimes_by_hand(hand, inquiry.blocks[first], heldout))
 
 
 def _explanations(hand):

@@ -20,6 +20,7 @@ from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import Gain, gain_in_turn
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.residual_analysis import Examination, inquire
+from imu_calibration.selection.residual_fit import largest_axes
 from imu_calibration.selection.spectrum import find_tones
 from imu_calibration.selection.unexplained import IN_MOTION, Unexplained, scatter_of_one_axis
 
@@ -152,14 +153,14 @@ def look_beyond(found: Examination) -> dict[str, Unexplained]:
 
 
 def _beyond_noise(found, sensor, rest):
-    """Return an insignificant rest as significant if loud tones or the scatter in motion of one axis exceed the noise at rest."""
+    """Return the residual of a sensor, as significant if loud tones or the scatter in motion of one axis exceed the noise at rest."""
     scatter, noise = scatter_of_one_axis(found.attempt, sensor), found.attempt.noise[sensor].white_variance
     squares = np.array(scatter)
     for tone in rest.tones:
-        axis = AXES.index(tone.axis)
-        squares[axis] += 0.5 * tone.amplitude**2 if 0.5 * tone.amplitude**2 > LOUD * noise[axis] else 0.0
+        axis, mean_square = AXES.index(tone.axis), 0.5 * tone.amplitude**2
+        if mean_square > LOUD * noise[axis]:
+            squares[axis] += mean_square
     if not squares.any():
         return rest
-    axes = tuple(AXES[k] for k in np.argsort(-squares) if squares[k])
-    return replace(rest, significant=True, rms=float(np.sqrt(squares.mean())), axes=axes,
+    return replace(rest, significant=True, rms=float(np.sqrt(squares.mean())), axes=largest_axes(squares, 0.0),
                    correlates_with=IN_MOTION if scatter.any() else None)
