@@ -37,7 +37,7 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
     Every eighth pose, with few attitudes one pose, is held out with the turns that begin or end there: one step from the solution without
     their rows. The error of the accelerometer is the length of its corrected reading in a pose less gravity; that of the
     gyroscope the angle between gravity rotated by its rates and gravity in the pose at the end of a turn. Readings are corrected as by
-    compensation; with effects that settle the last third of the poses is evaluated. With too few poses or turns there is no entry.
+    compensation; with effects that have settled the last third of the poses is evaluated. With too few poses or turns there is no entry.
 
     Parameters
     ----------

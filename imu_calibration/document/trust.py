@@ -21,7 +21,7 @@ from imu_calibration.kinematics.rotations import Reference
 END, MEAN = 'end of the recording', 'mean of the recording'
 AGAIN = '; it is proven for its last third only, and the error returns where the effect starts again'
 LAST_SHARE = 2.0 / 3.0
-"""Effects that settle are proven on the windows after this share of the recording: the value at its end is applied."""
+"""Effects that have settled are proven on the windows after this share of the recording: the value at its end is applied."""
 SETTLED = 0.1
 """An effect in time has settled if a recording of twice the length would change it by at most this share more: 2.3 time constants."""
 
@@ -58,7 +58,7 @@ def uncorrected_on_table(model: SensorModel, values: np.ndarray, accumulator: Ac
     centre, sizes = {}, []
     at_columns = replace(model, point=model.point | {e.name: gathered.point_of(e) for e in model.effects if e.time_constant})
     for effect in not_applied(model):
-        squares, at_end = np.zeros(3), settles(model, effect, end)
+        squares, at_end = np.zeros(3), has_settled(model, effect, end)
         for group in effect.groups:
             rows, own = gathered.layout(effect.sensor).rows[group.name], model.layout(effect.sensor).rows[group.name]
             means = np.array([row.sensors[effect.sensor].mean[rows] for row in accumulator.rows])
@@ -86,7 +86,7 @@ def uncorrected_in_time(model: SensorModel, values: np.ndarray, times: Sequence[
     """Return the uncorrected part of effects in time at `times`, s, of a recording that ends at `end`."""
     centre, sizes = {}, []
     for effect in not_applied(model):
-        at_end, at_times = settles(model, effect, end), columns_at(model, effect, times)
+        at_end, at_times = has_settled(model, effect, end), columns_at(model, effect, times)
         applied = columns_at(model, effect, [end]) if at_end else at_times
         centre |= {name: columns.mean(axis=0) for name, columns in applied.items()}
         rows = model.layout(effect.sensor).rows
@@ -101,11 +101,11 @@ def end_of(accumulator: Accumulator) -> float:
 
 
 def judged_from_of(model: SensorModel, end: float) -> float:
-    """Return the time from which windows are judged, s: the last third until `end` where effects of the model settle."""
-    return LAST_SHARE * end if any(settles(model, effect, end) for effect in not_applied(model)) else 0.0
+    """Return the time from which windows are judged, s: the last third until `end` where an effect of the model has settled."""
+    return LAST_SHARE * end if any(has_settled(model, effect, end) for effect in not_applied(model)) else 0.0
 
 
-def settles(model: SensorModel, effect: Effect, end: float) -> bool:
+def has_settled(model: SensorModel, effect: Effect, end: float) -> bool:
     """
     Return whether an effect in time has settled at the end of a recording, s, at the point of the model.
 

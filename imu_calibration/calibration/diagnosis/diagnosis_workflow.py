@@ -196,7 +196,7 @@ def onset_lines(onset: Onset | None) -> list[str]:
     states = [[in_words(state[name], onset.what, onset.units[name]).removesuffix(' 1') for state in (onset.before, onset.after)]
               for name in largest]
     values = '; '.join(f'{name} {before} before, {after} after' for name, (before, after) in zip(largest, states))
-    axes = f' (axis {" and ".join(onset.axes)})' if onset.axes else ''
+    axes = f' (axis {", ".join(onset.axes)})' if onset.axes else ''
     return [f'change at {onset.time:.1f} +- {onset.time_sd:.1g} s of {onset.what}{axes}: {values}',
             f'   it explains {100 * onset.share:.0f} % of the residual; other results: of the longer part; record again without the change']
 
