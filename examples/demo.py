@@ -13,10 +13,10 @@ from error_figures import before_and_after
 from imu_calibration.cli.main import main
 from imu_calibration.cli.show import show_table
 from imu_calibration.cli.terminal import Terminal
-from imu_calibration.compensation import stream
 from imu_calibration.core.units import error_text, significant
 from imu_calibration.document import files
 from imu_calibration.estimation.solution import LACKING
+from imu_calibration.preprocessing.window_finder import session_truth
 from imu_calibration.use_cases.recordings import source_of
 
 
@@ -37,7 +37,7 @@ def run(folder):
     verb('simulate', '--profile', 'navigation', '--seed', 2, '--imu-seed', 5, '--output', second)
     verb('compensate', second, '--calibration', folder / 'calibration.yaml', '--output', folder / 'other_session_corrected')
     table, calibration = files.read_table(second / 'table.yaml'), files.read_calibration(folder / 'calibration.yaml')
-    truth = stream.session_truth(source_of(second, joint_names=table.joint_names)(), table)
+    truth = session_truth(source_of(second, joint_names=table.joint_names)(), table)
     show(before_and_after(truth, calibration))
     lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
     print('not determined by this recording: ' + (', '.join(lacking) if lacking else 'none; every parameter is within its tolerance'))

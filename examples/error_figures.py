@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.compensation.compensate import FittedErrors
-from imu_calibration.compensation.stream import CompensationStream, SessionTruth
+from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.kinematics.strapdown import drift_over
+from imu_calibration.preprocessing.window_finder import SessionTruth
 
 
 @dataclass(frozen=True)

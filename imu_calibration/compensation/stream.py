@@ -1,7 +1,7 @@
 """Compensation of a recording or block by block, and its evaluation."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, overload
 
@@ -12,15 +12,10 @@ from imu_calibration.compensation.compensate import Corrected, FittedErrors, Tra
 from imu_calibration.compensation.covariance import Uncertainty, is_known
 from imu_calibration.compensation.rate_slope import WITHOUT, RateSlope
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
+from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.effects.base import Role
-from imu_calibration.kinematics.chain import reference_motion
-from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch
-from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.stamping import REGULAR, StampLine, describe_stamps
-from imu_calibration.preprocessing.window import WindowSettings
-from imu_calibration.preprocessing.window_finder import MotionGatherer
 
 CORRECTED_TOPIC_ENDINGS = ('data_corrected', 'corrected')
 """A topic with this ending is refused, because a second correction would be wrong."""
@@ -282,32 +277,3 @@ def _as_temperatures(temperature_c, stamp_ns):
     if temperature_c is None or isinstance(temperature_c, TemperatureSamples):
         return temperature_c
     return TemperatureSamples(stamp_ns, np.broadcast_to(np.asarray(temperature_c, float), stamp_ns.shape))
-
-
-@dataclass(frozen=True, eq=False)
-class SessionTruth:
-    """Measured samples with their reference from the table."""
-
-    imu: ImuSamples
-    """Samples with a reference."""
-    reference: Reference
-    """True motion at their stamps."""
-
-
-def session_truth(blocks: Iterable[SampleBlock], table: Table) -> SessionTruth:
-    """Return the samples of a session with their reference, where joints and IMU are both present."""
-    windows = MotionGatherer(table, WindowSettings(), keep_unused=True).all_of(blocks)
-    references = [_reference(window, table) for window in windows]
-    stamp_ns, force_s, rate_s = (np.concatenate([getattr(w, name) for w in windows]) for name in ('stamp_ns', 'force_s', 'rate_s'))
-    names = ('time', 'mat_sn', 'force_s', 'rate_s', 'alpha_s')
-    joined = {name: np.concatenate([getattr(r, name) for r in references]) for name in names}
-    return SessionTruth(ImuSamples(stamp_ns, force_s, rate_s), Reference(**joined, gravity=table.gravity_value))
-
-
-def _reference(window, table):
-    """Return the reference at every sample; the motion of a static window is one row for all samples."""
-    motion = window.motion
-    if len(motion) != len(window.time):
-        motion = motion.select(np.zeros(len(window.time), int))
-    reference = reference_motion(table, motion)
-    return Reference(window.time, reference.mat_sn, reference.force_s, reference.rate_s, reference.alpha_s, reference.gravity)

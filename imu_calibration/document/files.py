@@ -14,10 +14,8 @@ from pathlib import Path
 from secrets import token_hex
 from stat import S_ISDIR
 from tempfile import TemporaryFile
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from imu_calibration.allan.document import noise_from_text
-from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.core import documents
 from imu_calibration.core.documents import open_regular
 from imu_calibration.core.errors import InputError, shortened
@@ -25,6 +23,9 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text, checked_tolerances
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.kinematics.table import Table
+
+if TYPE_CHECKING:
+    from imu_calibration.allan.figures import NoiseFigures
 
 
 def user_path(text: str) -> Path:
@@ -135,8 +136,9 @@ def given_calibration(chosen: Calibration | str | PathLike[str]) -> Calibration:
     return read_calibration(chosen) if isinstance(chosen, (str, PathLike)) else chosen
 
 
-def read_noise(path: str | os.PathLike) -> NoiseFigures:
+def read_noise(path: str | os.PathLike) -> 'NoiseFigures':
     """Return the noise in a file that the verb `noise` wrote; an error names the file."""
+    from imu_calibration.allan.document import noise_from_text  # here, because a compensator needs 1 MB less without it
     try:
         return noise_from_text(read_text(path, 'noise document'))
     except InputError as error:

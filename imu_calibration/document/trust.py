@@ -2,11 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import HAND_AXES, Calibration, beyond_instruments, listed, with_nominal
@@ -17,6 +16,9 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.kinematics.rotations import Reference
+
+if TYPE_CHECKING:   # the compensator node is smaller without it
+    from imu_calibration.allan.figures import NoiseFigures
 
 END, MEAN = 'end of the recording', 'mean of the recording'
 AGAIN = '; it is proven for its last third only, and the error returns where the effect starts again'
@@ -245,7 +247,7 @@ def standing(calibration: Calibration) -> str:
     return decisions_text(calibration.decisions)
 
 
-def with_measured_noise(calibration: Calibration, figures: NoiseFigures) -> Calibration:
+def with_measured_noise(calibration: Calibration, figures: 'NoiseFigures') -> Calibration:
     """
     Return the calibration with the white noise of noise.yaml in its statistics.
 

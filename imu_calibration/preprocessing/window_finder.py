@@ -1,11 +1,14 @@
 """Windows from streams: blocks are converted to static, spinning and dynamic windows with the joints' motion."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import JointSamples, NominalScaling, SampleBlock
+from imu_calibration.core.samples import ImuSamples, JointSamples, NominalScaling, SampleBlock
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.rest_detection import QuietFloor
 from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT, MotionChunks
@@ -197,3 +200,32 @@ def _add_counts(total, counts):
 def _span(queue):
     first, last = queue[0][1].stamp_ns[0], queue[-1][1].stamp_ns[-1]
     return abs(int(last) - int(first)) / 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class SessionTruth:
+    """Measured samples with their reference from the table."""
+
+    imu: ImuSamples
+    """Samples with a reference."""
+    reference: Reference
+    """True motion at their stamps."""
+
+
+def session_truth(blocks: Iterable[SampleBlock], table: Table) -> SessionTruth:
+    """Return the samples of a session with their reference, where joints and IMU are both present."""
+    windows = MotionGatherer(table, WindowSettings(), keep_unused=True).all_of(blocks)
+    references = [_reference(window, table) for window in windows]
+    stamp_ns, force_s, rate_s = (np.concatenate([getattr(w, name) for w in windows]) for name in ('stamp_ns', 'force_s', 'rate_s'))
+    names = ('time', 'mat_sn', 'force_s', 'rate_s', 'alpha_s')
+    joined = {name: np.concatenate([getattr(r, name) for r in references]) for name in names}
+    return SessionTruth(ImuSamples(stamp_ns, force_s, rate_s), Reference(**joined, gravity=table.gravity_value))
+
+
+def _reference(window, table):
+    """Return the reference at every sample; the motion of a static window is one row for all samples."""
+    motion = window.motion
+    if len(motion) != len(window.time):
+        motion = motion.select(np.zeros(len(window.time), int))
+    reference = reference_motion(table, motion)
+    return Reference(window.time, reference.mat_sn, reference.force_s, reference.rate_s, reference.alpha_s, reference.gravity)

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from imu_calibration.compensation.stream import session_truth
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.exports.export import Export, export, find_reader, find_target
 from imu_calibration.document.exports.loss import TrialMotion, import_file, motion_of, recorded_motion, temperature_at
+from imu_calibration.preprocessing.window_finder import session_truth
 from imu_calibration.use_cases.recordings import Topics, name_of, source_of, temperatures
 from imu_calibration.use_cases.stand import Stand, table_of
 

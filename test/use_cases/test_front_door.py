@@ -44,8 +44,8 @@ def samples():
 
 
 def modules_after(statement):
-    """Top-level modules that a fresh interpreter holds after a statement."""
-    code = f'import sys; before = set(sys.modules); {statement}; print(*{{name.partition(".")[0] for name in set(sys.modules) - before}})'
+    """Modules that a fresh interpreter holds after a statement."""
+    code = f'import sys; before = set(sys.modules); {statement}; print(*set(sys.modules) - before)'
     done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
     return set(done.stdout.split())
 
@@ -58,6 +58,12 @@ def test_the_package_alone_imports_nothing_heavy():
 @pytest.mark.live
 def test_its_functions_come_without_ros_and_without_a_screen():
     assert not modules_after('import imu_calibration as imu; imu.calibrate, imu.load') & {'rclpy', 'rosbags', 'matplotlib', 'tqdm', 'sensor_msgs'}
+
+
+@pytest.mark.live
+def test_the_compensator_node_keeps_the_memory_of_filters_windows_and_noise_models_free():
+    assert not modules_after('import imu_calibration.nodes.compensator_node') & {
+        'scipy.ndimage', 'imu_calibration.allan', 'imu_calibration.preprocessing.window_finder'}
 
 
 def test_the_names_are_those_that_a_type_checker_sees():

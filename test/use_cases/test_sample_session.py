@@ -60,8 +60,8 @@ def test_compare_with_the_truth(output, capsys):
 def test_compensated_bag(output, tmp_path):
     """The corrected topic stands beside the others and is closer to the reference."""
     from examples.error_figures import before_and_after
-    from imu_calibration.compensation.stream import session_truth
     from imu_calibration.kinematics.table import Table
+    from imu_calibration.preprocessing.window_finder import session_truth
     from msg_adapters.bag import open_recording
     corrected = tmp_path / 'corrected'
     assert main(['compensate', str(BAG), '--calibration', str(output / 'calibration.yaml'), '--output', str(corrected)]) == 0
