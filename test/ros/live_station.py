@@ -143,17 +143,22 @@ class Station:
         while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.05)
 
-    def call(self, service):
-        """Call a Trigger service and return its response; an answer may be lost before both sides know each other, and is asked for again."""
+    def call(self, service, kind=None, again=PATIENCE / 3, **fields):
+        """
+        Call a service (Trigger unless `kind` is given) and return its response.
+
+        An answer may be lost before both sides know each other, and is asked for again every `again` seconds.
+        """
         from std_srvs.srv import Trigger
-        client = self.node.create_client(Trigger, service)
+        kind = kind or Trigger
+        client = self.node.create_client(kind, service)
         try:
             self.until(client.service_is_ready, f'service {service}')
             asked, began = [], time.monotonic()
 
             def answered():
-                if time.monotonic() - began >= len(asked) * PATIENCE / 3:
-                    asked.append(client.call_async(Trigger.Request()))
+                if time.monotonic() - began >= len(asked) * again:
+                    asked.append(client.call_async(kind.Request(**fields)))
                 return any(future.done() for future in asked)
             self.until(answered, f'the answer of {service}')
             return next(future for future in asked if future.done()).result()
