@@ -18,7 +18,7 @@ from imu_calibration.core.errors import ImuCalibrationError, NotObservableError,
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.trust import missing
 from imu_calibration.nodes.calibration_status import WorkerState
-from imu_calibration.nodes.diagnosis_thread import DiagnosisThread, Listeners, Request
+from imu_calibration.nodes.diagnosis_thread import DiagnosisThread, Listeners, Request, return_freed_memory
 from imu_calibration.nodes.session_files import SessionFiles
 from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.preprocessing.window import WindowSettings
@@ -205,6 +205,7 @@ class CalibrationWorker(threading.Thread):
         self._note_fault('solution', '')
         text = calibration_to_text(result.calibration)
         self.listeners.calibration(text)
+        return_freed_memory()
         self._pacer.note(start, time.monotonic())
         return result, text
 
