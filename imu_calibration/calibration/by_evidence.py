@@ -113,8 +113,7 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
         return EvidentSolution(*first)
     baseline = baseline_model(options, table, solution.model)
     found, *others = (inquire(windows, table, baseline, bias_processes=options.bias_processes) for windows in parts)
-    for each in (found, *others):
-        each.free()   # the solutions below need that memory
+    unexplained = [_unexplained(each) for each in (found, *others)]
     found, more = _without_faint(found, solution), _named_elsewhere(found, others)
     added, point = (), {}
     while beyond := _beyond((*found.adopted, *more), first[2]):
@@ -130,7 +129,7 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
             break
     else:
         added, point, (solution, gathered, model) = (), {}, first
-    demand = Demand(added, point, _changes([found, *others], added), _moves(found), _clipped(found))
+    demand = Demand(added, point, _changes([found, *others], added, unexplained), _moves(found), _clipped(found))
     return EvidentSolution(demand.applied(solution), gathered, model, demand, found)
 
 
@@ -153,9 +152,9 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
     if not parts:
         return EvidentSolution(*solved, known)
     found = inquire(parts[0], table, baseline_model(options, table, solution.model), bias_processes=options.bias_processes)
-    found = _without_faint(found, solution)
+    unexplained, found = _unexplained(found), _without_faint(found, solution)
     lacking = [] if found.limits else _beyond(found.adopted, model)   # after a limit was found, the solution is that of the search
-    changes = replace(_changes([found], known.added), lacking=tuple(question.name for question in lacking))
+    changes = replace(_changes([found], known.added, [unexplained]), lacking=tuple(question.name for question in lacking))
     demand = Demand(known.added, known.point, changes, (*known.moves, *_moves(found, lacking)), _clipped(found))
     return EvidentSolution(demand.applied(solution), gathered, model, demand, found)
 
@@ -171,11 +170,24 @@ def _clipped(found):
                              saturations=found.limits) if found.limits else None
 
 
-def _changes(searches, added):
-    """Return the changes of the requested model by searches (the first has priority) and by the effects that they added."""
+def _unexplained(found):
+    """Return sensor -> rms and axes of the unexplained residual of a search, and free its blocks: the solutions need that memory."""
+    rests = {sensor: {'rms': rest.rms, 'axes': list(rest.axes)} for sensor, rest in found.unexplained.items() if rest.significant}
+    found.free()
+    return rests
+
+
+def _changes(searches, added, unexplained):
+    """
+    Return the changes of the requested model by searches (the first has priority) and by the effects that they added.
+
+    `unexplained` has their unexplained residuals.
+    """
     found, model = searches[0], searches[0].attempt.baseline
     clipping = (model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name for limit in found.limits)
-    return ModelChanges((*clipping, *(name for _, name in added)), tuple(question.name for question in found.denied), _strange(searches))
+    rests = {sensor: rest for each in reversed(unexplained) for sensor, rest in each.items()}
+    return ModelChanges((*clipping, *(name for _, name in added)), tuple(question.name for question in found.denied), _strange(searches),
+                        unexplained=rests)
 
 
 def _beyond(named, model):

@@ -43,18 +43,20 @@ class ModelChanges:
     """
     lacking: tuple[str, ...] = ()
     """Demanded, but the motion of before is no longer kept, so that they cannot join; the standard deviations allow for them."""
+    unexplained: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Sensor -> rms and axes of its unexplained residual, of the test that diagnoses use."""
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""
         changes = (('added', list(self.added)), ('denied', list(self.denied)), ('implausible', self.implausible),
-                   ('lacking', list(self.lacking)))
+                   ('lacking', list(self.lacking)), ('unexplained', self.unexplained))
         return {name: value for name, value in changes if value}
 
     @classmethod
     def from_mapping(cls, known: Mapping[str, Any]) -> 'ModelChanges':
         """Return the changes from the mapping of `to_mapping`."""
         return cls(tuple(known.get('added', ())), tuple(known.get('denied', ())), dict(known.get('implausible', {})),
-                   tuple(known.get('lacking', ())))
+                   tuple(known.get('lacking', ())), dict(known.get('unexplained', {})))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +93,7 @@ class Demand:
 
     @property
     def is_nothing(self) -> bool:
-        """Whether the solution of the requested model is unchanged."""
+        """Whether the solution of the requested model and its notes are unchanged."""
         return not (self.added or self.moves or self.clipped or self.changes != ModelChanges())
 
     def to_mapping(self) -> dict[str, Any]:

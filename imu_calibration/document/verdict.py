@@ -45,7 +45,7 @@ LOST_SHARE = 0.05
 def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     """Return the notes; arguments as in `verdict.judge`."""
     remaining = [Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)]
-    return (_worse(calibration) + _unused_rests(calibration) + remaining + _adopted(calibration)
+    return (_worse(calibration) + _unused_rests(calibration) + remaining + _adopted(calibration) + _unexplained(calibration)
             + unsteady(calibration, tolerances) + _left_out(calibration) + _lost(calibration))
 
 
@@ -83,6 +83,16 @@ def _adopted(calibration):
     return notes + ([Reason(NOTE, 'held, because only the misfit of the model determines them, at an implausible value: '
                             f'{_strange(strange)}',
                             'move the table so that gravity or the rate of turn act along their axes')] if strange else [])
+
+
+def _unexplained(calibration):
+    """Return notes on the unexplained residuals of the search, by the test of diagnoses."""
+    notes = []
+    for sensor, rest in (calibration.statistics.get('unexplained') or {}).items():
+        factor, unit = for_people(UNITS[sensor])
+        notes.append(Reason(NOTE, f'{significant(rest["rms"] * factor, 2)} {unit} rms of the {sensor} residual are unexplained '
+                                  f'({", ".join(rest["axes"])})', 'find the cause', key='diagnose', sensors=(sensor,)))
+    return notes
 
 
 def _strange(values):

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from imu_calibration.core.progress import report
 from imu_calibration.effects.base import AXES
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
@@ -17,7 +18,8 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regimes import RestRegime, find_regimes
 from imu_calibration.selection.residual_blocks import RestBlocks, rest_blocks
 from imu_calibration.selection.residual_fit import BlockFits
-from imu_calibration.selection.unexplained import Unexplained, unexplained
+from imu_calibration.selection.spectrum import find_tones
+from imu_calibration.selection.unexplained import Unexplained, beyond_noise, unexplained
 
 MIN_FORMULA_SDS = 10.0
 """Standard deviations above noise at rest from which a formula is searched in moving blocks."""
@@ -84,6 +86,27 @@ class Examination(Investigation):
         known = {'temperature_ref_c': self.attempt.recording.model.temperature_ref_c}
         means = [blocks.means(group.columns(blocks.ref, known)) for group in groups]
         return np.stack([np.broadcast_to(mean, (len(mean), 3)) for mean in means], axis=1)
+
+    @cached_property
+    def unexplained(self) -> dict[str, Unexplained]:
+        """Sensor -> the unexplained excess with its tones, and with regimes and a proposal where it is significant."""
+        report('analysing the residual')
+        tones = find_tones(self, self.table, [proposal for sensor in self.rests if (proposal := self.proposal(sensor)) is not None])
+        return {sensor: self._unexplained(sensor, replace(rest, tones=tones[sensor])) for sensor, rest in self.rests.items()}
+
+    def _unexplained(self, sensor, rest):
+        proposal = self.proposal(sensor)
+        regimes = self.regimes(sensor, formula=self.columns(sensor, proposal))
+        first = {regime.axis: regime for regime in reversed(regimes)}
+        if not rest.significant and proposal is None and not first:
+            return beyond_noise(self.attempt, sensor, rest)
+        axes = rest.axes or (self.fits(sensor).axes() if proposal is not None else tuple(first))
+        found = replace(rest, regimes=tuple(first[axis] for axis in axes if axis in first), proposal=proposal,
+                        axes=axes if proposal is None else proposal.axes)
+        if rest.significant:
+            return found
+        sizes = proposal.sizes if proposal is not None else [regime.size * np.sqrt(regime.inside.mean()) for regime in first.values()]
+        return replace(found, significant=True, rms=float(np.hypot.reduce(sizes)))
 
     def free(self) -> None:
         """Free the blocks and their fits; they are computed again on demand."""

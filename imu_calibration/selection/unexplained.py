@@ -1,7 +1,7 @@
 """The residual after the test of every effect: its size, its correlation, and its regimes in the session."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import ExplainedWindows
 from imu_calibration.selection.questions import Question
+from imu_calibration.selection.residual_fit import largest_axes
 
 SIGNIFICANT_SDS = 5.0
 """Standard deviations above noise from which a rest is significant."""
@@ -25,6 +26,9 @@ IN_MOTION = 'motion (moving windows against windows at rest)'
 """Name of the variable that separates moving windows from windows at rest."""
 MUCH_SCATTER = 10.0
 """Least excess variance in motion, over the noise at rest and over the excess of the middle axis, of an axis with a cause of its own."""
+
+LOUD = 0.5
+"""Least mean square of a tone over the variance of the noise at rest, from which it is an unexplained residual."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +68,21 @@ def unexplained(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[
     return {sensor: _rest(attempt, explained, sensor, excess[sensor], values) for sensor in SENSORS}
 
 
-def scatter_of_one_axis(attempt: Attempt, sensor: str) -> np.ndarray:
+def beyond_noise(attempt: Attempt, sensor: str, rest: Unexplained) -> Unexplained:
+    """Return the residual of a sensor, as significant if loud tones or the scatter in motion of one axis exceed the noise at rest."""
+    scatter, noise = _scatter_of_one_axis(attempt, sensor), attempt.noise[sensor].white_variance
+    squares = np.array(scatter)
+    for tone in rest.tones:
+        axis, mean_square = AXES.index(tone.axis), 0.5 * tone.amplitude**2
+        if mean_square > LOUD * noise[axis]:
+            squares[axis] += mean_square
+    if not squares.any():
+        return rest
+    return replace(rest, significant=True, rms=float(np.sqrt(squares.mean())), axes=largest_axes(squares, 0.0),
+                   correlates_with=IN_MOTION if scatter.any() else None)
+
+
+def _scatter_of_one_axis(attempt: Attempt, sensor: str) -> np.ndarray:
     """
     Return the excess variance of moving samples over the noise at rest of an axis that exceeds the others, shape (3,); otherwise 0.
 

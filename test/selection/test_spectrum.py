@@ -5,15 +5,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import imu_calibration as imu
 from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.catalogue import term
+from imu_calibration.kinematics.table import Table
 from imu_calibration.report.figures import draw_tones
 from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.spectrum import _without, find_tones, of_stretches
 from imu_calibration.selection.unexplained import IN_MOTION
 
 from worlds.hiding import record
+from worlds.physics import make_session
 from worlds.physics_beyond import Machine
 from worlds.physics_cause import Cause
 from worlds.physics_draw import MG
@@ -95,3 +98,15 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
     if size:
         assert [(rest.axes, rest.correlates_with) for rest in found.values()] == [(('z',), None), (('y',), IN_MOTION)]
         assert found['accelerometer'].rms == pytest.approx(20 * MG / np.sqrt(6), rel=0.1)   # a mean over three axes, as of other residuals
+
+
+@pytest.mark.usefixtures('few_candidates')
+def test_calibrate_reports_the_same_unexplained_residuals_as_diagnose():
+    """Calibrate had no test of either: its document had no residual where the diagnosis was "unexplained"."""
+    session = make_session(5, None, 'realistic', cause=Loud(1.0))
+    reported = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration.statistics['unexplained']
+    found = imu.diagnose(session.block, Table.from_mapping(session.table)).result.diagnosis.unexplained
+    assert reported == {sensor: {'rms': pytest.approx(rest.rms), 'axes': list(rest.axes)} for sensor, rest in found.items() if rest.significant}
+    assert {sensor: rest['axes'] for sensor, rest in reported.items()} == {'accelerometer': ['z'], 'gyroscope': ['y']}
+    empty = make_session(5, None, 'realistic')
+    assert 'unexplained' not in imu.calibrate(empty.block, Table.from_mapping(empty.table)).calibration.statistics

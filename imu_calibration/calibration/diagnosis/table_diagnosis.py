@@ -10,8 +10,7 @@ from imu_calibration.calibration.diagnosis.applied_gain import gain_of_findings
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, parameters_of
 from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of_one_joint, sentence, separating_motion
 from imu_calibration.calibration.diagnosis.traces import residual_traces
-from imu_calibration.core.progress import report
-from imu_calibration.effects.base import AXES, SENSORS, Role
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.table import Table
@@ -20,15 +19,9 @@ from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import Gain, gain_in_turn
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.residual_analysis import Examination, inquire
-from imu_calibration.selection.residual_fit import largest_axes
-from imu_calibration.selection.spectrum import find_tones
-from imu_calibration.selection.unexplained import IN_MOTION, Unexplained, scatter_of_one_axis
 
 MATE = 0.5
 """Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's reduction."""
-
-LOUD = 0.5
-"""Least mean square of a tone over the variance of the noise at rest, from which it is an unexplained residual."""
 HALF = 0.5
 """Share of a finding that an unnamed effect would replace, from which it is reported with the finding."""
 
@@ -79,7 +72,7 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
 
     """
     attempt, named, limits = found.attempt, found.named, found.limits
-    rests = look_beyond(Examination.of(found, table))
+    rests = Examination.of(found, table).unexplained
     baseline = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=[])
     solution = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=named,
                                  saturations=limits) if named or limits else baseline
@@ -129,38 +122,3 @@ def _clipping(limit, solution):
     gain = Gain(limit.sensor, 'clipped samples', limit.rms_before, limit.rms_after, (float('nan'), float('nan')), 0)
     return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, n_clipped=limit.n_clipped), parameters, limit.p_value,
                    limit.n_expected, 1.0, gain, (), '')
-
-
-def look_beyond(found: Examination) -> dict[str, Unexplained]:
-    """Return sensor -> the unexplained excess with its tones, and with regimes and a proposal where it is significant."""
-    report('analysing the residual')
-    tones = find_tones(found, found.table, [proposal for sensor in found.rests if (proposal := found.proposal(sensor)) is not None])
-    looked = {sensor: replace(rest, tones=tones[sensor]) for sensor, rest in found.rests.items()}
-    for sensor, rest in looked.items():
-        proposal = found.proposal(sensor)
-        regimes = found.regimes(sensor, formula=found.columns(sensor, proposal))
-        first = {regime.axis: regime for regime in reversed(regimes)}
-        if rest.significant or proposal is not None or first:
-            axes = rest.axes or (found.fits(sensor).axes() if proposal is not None else tuple(first))
-            looked[sensor] = replace(rest, regimes=tuple(first[axis] for axis in axes if axis in first), proposal=proposal,
-                                     axes=axes if proposal is None else proposal.axes)
-        if (proposal is not None or first) and not rest.significant:
-            sizes = proposal.sizes if proposal is not None else [regime.size * np.sqrt(regime.inside.mean()) for regime in first.values()]
-            looked[sensor] = replace(looked[sensor], significant=True, rms=float(np.hypot.reduce(sizes)))
-        elif not rest.significant:
-            looked[sensor] = _beyond_noise(found, sensor, looked[sensor])
-    return looked
-
-
-def _beyond_noise(found, sensor, rest):
-    """Return the residual of a sensor, as significant if loud tones or the scatter in motion of one axis exceed the noise at rest."""
-    scatter, noise = scatter_of_one_axis(found.attempt, sensor), found.attempt.noise[sensor].white_variance
-    squares = np.array(scatter)
-    for tone in rest.tones:
-        axis, mean_square = AXES.index(tone.axis), 0.5 * tone.amplitude**2
-        if mean_square > LOUD * noise[axis]:
-            squares[axis] += mean_square
-    if not squares.any():
-        return rest
-    return replace(rest, significant=True, rms=float(np.sqrt(squares.mean())), axes=largest_axes(squares, 0.0),
-                   correlates_with=IN_MOTION if scatter.any() else None)
