@@ -178,11 +178,7 @@ def _unexplained(found):
 
 
 def _changes(searches, added, unexplained):
-    """
-    Return the changes of the requested model by searches (the first has priority) and by the effects that they added.
-
-    `unexplained` has their unexplained residuals.
-    """
+    """Return the changes of the requested model by searches (the first has priority), their effects and `_unexplained` residuals."""
     found, model = searches[0], searches[0].attempt.baseline
     clipping = (model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name for limit in found.limits)
     rests = {sensor: rest for each in reversed(unexplained) for sensor, rest in each.items()}

@@ -30,7 +30,7 @@ from imu_calibration.references.turntable.gathered import Gathered
 
 @dataclass(frozen=True)
 class ModelChanges:
-    """Names of effects, the strongest first."""
+    """Names of effects, the strongest first, and the residual that none of them explains."""
 
     added: tuple[str, ...] = ()
     """Added to the model because the data support them."""
@@ -44,7 +44,7 @@ class ModelChanges:
     lacking: tuple[str, ...] = ()
     """Demanded, but the motion of before is no longer kept, so that they cannot join; the standard deviations allow for them."""
     unexplained: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Sensor -> rms and axes of its unexplained residual, of the test that diagnoses use."""
+    """Sensor -> rms and axes of its unexplained residual, by the test of `diagnose`."""
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""

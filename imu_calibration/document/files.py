@@ -138,7 +138,7 @@ def given_calibration(chosen: Calibration | str | PathLike[str]) -> Calibration:
 
 def read_noise(path: str | os.PathLike) -> 'NoiseFigures':
     """Return the noise in a file that the verb `noise` wrote; an error names the file."""
-    from imu_calibration.allan.document import noise_from_text  # here, because a compensator needs 1 MB less without it
+    from imu_calibration.allan.document import noise_from_text  # here, because its import takes 1 MB of the compensator node
     try:
         return noise_from_text(read_text(path, 'noise document'))
     except InputError as error:

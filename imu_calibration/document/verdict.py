@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.core.units import for_people, significant
+from imu_calibration.core.units import error_text, for_people, significant
 from imu_calibration.document.calibration import (
     HAND_AXES,
     MAX_MISFIT_RATIO,
@@ -87,12 +87,9 @@ def _adopted(calibration):
 
 def _unexplained(calibration):
     """Return notes on the unexplained residuals of the search, by the test of diagnoses."""
-    notes = []
-    for sensor, rest in (calibration.statistics.get('unexplained') or {}).items():
-        factor, unit = for_people(UNITS[sensor])
-        notes.append(Reason(NOTE, f'{significant(rest["rms"] * factor, 2)} {unit} rms of the {sensor} residual are unexplained '
-                                  f'({", ".join(rest["axes"])})', 'find the cause', key='diagnose', sensors=(sensor,)))
-    return notes
+    return [Reason(NOTE, f'{error_text(rest["rms"], UNITS[sensor], 2)} rms of the {sensor} residual are unexplained ({", ".join(rest["axes"])})',
+                   'find the cause', key='diagnose', sensors=(sensor,))
+            for sensor, rest in (calibration.statistics.get('unexplained') or {}).items()]
 
 
 def _strange(values):

@@ -147,7 +147,7 @@ class Station:
         """
         Call a service (Trigger unless `kind` is given) and return its response.
 
-        An answer may be lost before both sides know each other, and is asked for again every `again` seconds.
+        An answer may be lost before both sides are connected; the call is repeated every `again` seconds.
         """
         from std_srvs.srv import Trigger
         kind = kind or Trigger

@@ -102,7 +102,7 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
 
 @pytest.mark.usefixtures('few_candidates')
 def test_calibrate_reports_the_same_unexplained_residuals_as_diagnose():
-    """Calibrate had no test of either: its document had no residual where the diagnosis was "unexplained"."""
+    """Tones and the scatter of one axis were tested by `diagnose` only."""
     session = make_session(5, None, 'realistic', cause=Loud(1.0))
     reported = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration.statistics['unexplained']
     found = imu.diagnose(session.block, Table.from_mapping(session.table)).result.diagnosis.unexplained
