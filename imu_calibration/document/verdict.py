@@ -87,7 +87,8 @@ def _adopted(calibration):
 
 def _unexplained(calibration):
     """Return notes on the unexplained residuals of the search, by the test of diagnoses."""
-    return [Reason(NOTE, f'{error_text(rest["rms"], UNITS[sensor], 2)} rms of the {sensor} residual are unexplained ({", ".join(rest["axes"])})',
+    return [Reason(NOTE, f'{error_text(rest["rms"], UNITS[sensor], 2)} rms of the {sensor} residual are unexplained '
+                         f'({", ".join(rest["axes"])})',
                    'find the cause', key='diagnose', sensors=(sensor,))
             for sensor, rest in (calibration.statistics.get('unexplained') or {}).items()]
 

@@ -1,4 +1,4 @@
-"""Windows from streams: blocks are converted to static, spinning and dynamic windows with the joints' motion, and to samples with their reference."""
+"""Windows from streams: static, spinning and dynamic windows with the joints' motion, and samples with their reference."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
