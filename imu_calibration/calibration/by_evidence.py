@@ -112,8 +112,7 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
     if not parts:
         return EvidentSolution(*first)
     baseline = baseline_model(options, table, solution.model)
-    found, *others = (inquire(windows, table, baseline, bias_processes=options.bias_processes) for windows in parts)
-    unexplained = [_unexplained(each) for each in (found, *others)]
+    found, *others = (_examined(inquire(windows, table, baseline, bias_processes=options.bias_processes)) for windows in parts)
     found, more = _without_faint(found, solution), _named_elsewhere(found, others)
     added, point = (), {}
     while beyond := _beyond((*found.adopted, *more), first[2]):
@@ -129,7 +128,7 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
             break
     else:
         added, point, (solution, gathered, model) = (), {}, first
-    demand = Demand(added, point, _changes([found, *others], added, unexplained), _moves(found), _clipped(found))
+    demand = Demand(added, point, _changes([found, *others], added), _moves(found), _clipped(found))
     return EvidentSolution(demand.applied(solution), gathered, model, demand, found)
 
 
@@ -152,9 +151,9 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
     if not parts:
         return EvidentSolution(*solved, known)
     found = inquire(parts[0], table, baseline_model(options, table, solution.model), bias_processes=options.bias_processes)
-    unexplained, found = _unexplained(found), _without_faint(found, solution)
+    found = _without_faint(_examined(found), solution)
     lacking = [] if found.limits else _beyond(found.adopted, model)   # after a limit was found, the solution is that of the search
-    changes = replace(_changes([found], known.added, [unexplained]), lacking=tuple(question.name for question in lacking))
+    changes = replace(_changes([found], known.added), lacking=tuple(question.name for question in lacking))
     demand = Demand(known.added, known.point, changes, (*known.moves, *_moves(found, lacking)), _clipped(found))
     return EvidentSolution(demand.applied(solution), gathered, model, demand, found)
 
@@ -170,18 +169,19 @@ def _clipped(found):
                              saturations=found.limits) if found.limits else None
 
 
-def _unexplained(found):
-    """Return sensor -> rms and axes of the unexplained residual of a search, and free its blocks: the solutions need that memory."""
-    rests = {sensor: {'rms': rest.rms, 'axes': list(rest.axes)} for sensor, rest in found.unexplained.items() if rest.significant}
+def _examined(found):
+    """Return a search whose unexplained residual is known, with its blocks freed: the solutions need that memory."""
+    assert found.unexplained is not None   # cached
     found.free()
-    return rests
+    return found
 
 
-def _changes(searches, added, unexplained):
-    """Return the changes of the requested model by searches (the first has priority), their effects and `_unexplained` residuals."""
+def _changes(searches, added):
+    """Return the changes of the requested model by searches (the first has priority) and their effects."""
     found, model = searches[0], searches[0].attempt.baseline
     clipping = (model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name for limit in found.limits)
-    rests = {sensor: rest for each in reversed(unexplained) for sensor, rest in each.items()}
+    rests = {sensor: {'rms': rest.rms, 'axes': list(rest.axes)} for each in reversed(searches)
+             for sensor, rest in _examined(each).unexplained.items() if rest.significant}
     return ModelChanges((*clipping, *(name for _, name in added)), tuple(question.name for question in found.denied), _strange(searches),
                         unexplained=rests)
 

@@ -260,6 +260,7 @@ def _of_input(ending, texts):
 
 
 CONSTANT = ColumnGroup('one', ('1',))
+TIME = ColumnGroup('time', ('time',))
 TRUE_INPUT = _of_input('', lambda v: v)
 SQUARES = _of_input('_squares', lambda v: [f'{v[j]} * {v[k]}' for j, k in PRODUCT_PAIRS])
 CUBES = _of_input('_cubes', lambda v: [f'{v[i]} * {v[j]} * {v[k]}' for i, j, k in TRIPLES])

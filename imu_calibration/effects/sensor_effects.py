@@ -139,6 +139,12 @@ def _pair(sensor):
             motion=('warm_up',), compensation='none', groups=(own['WARM_UP'],),
             coefficients=amplitude_coefficients),
         Effect(
+            name=f'{short}_bias_trend', sensor=sensor, components=VECTOR, shape=(3,), unit=f'{unit}/s', smooth=True, against=('time',),
+            explanation=f'The {sensor} bias changes linearly with time.',
+            tolerance=small / 600, tolerance_reason='as the bias, over 10 min', prior_sd=50 * small / 600,
+            plausible=(('consumer', (20 * MILLI_G if accel else 1 * DEG) / 60, 'as the drift after turn-on, within 1 min'),),
+            motion=('warm_up',), compensation='none', groups=(base.TIME,), coefficients=amplitude_coefficients),
+        Effect(
             name=f'{short}_saturation', sensor=sensor, role=Role.LIMIT, components=('level',), shape=(), unit=unit,
             explanation=f'The {sensor} output is clipped: it cannot follow inputs beyond its range.',
             tolerance=0.01 * full, tolerance_reason='10 mg of the range' if accel else '1 deg/s of the range', prior=np.inf,

@@ -125,7 +125,7 @@ def _places(coordinates, key):
 
 def _require_shown_by_motion(model, key):
     effect = model.catalogue.find(*key, model.joint_names)
-    if special(effect) or 'temperature' in effect.needs:
+    if special(effect) or effect.smooth or 'temperature' in effect.needs:
         raise InputError(f"effects that motion separates must depend on it, '{key[1]}' depends on time, temperature or range; "
                          'omit it')
 

@@ -19,6 +19,7 @@ from msg_adapters.write import write_session
 
 from worlds.hand_sessions import GRAVITY, simulate
 
+FEW = ('accel_quadratic', 'accel_bias_drift', 'gyro_g_sensitivity', 'gyro_bandwidth', 'gyro_bias_drift', 'gyro_bias_trend', 'time_offset')
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
 FORMULA = CATALOGUE.with_effects(term('warm_force', sensor='gyroscope', column='f_x * (temperature_c - temperature_ref_c)', unit='(rad/s)/(m/s^2)/K',
@@ -87,7 +88,7 @@ def drifting(size=0.5 * DEG, time_constant=35.0):
     """Return (samples, table, bias at the end, bias at the start, duration in s) of a session whose gyroscope bias drifts by `size` on each axis."""
     session = imu.simulate('random_short', seed=7, imu_rate=50.0)
     time = 1e-9 * (session.samples.imu.stamp_ns - session.samples.imu.stamp_ns[0])
-    course = -size * np.expm1(-time / time_constant)
+    course = -size * np.expm1(-time / time_constant) if np.isfinite(time_constant) else size * time / time[-1]
     bias = session.truth.value('gyroscope', 'bias')
     moved = replace(session.samples, imu=replace(session.samples.imu, rate_s=session.samples.imu.rate_s + course[:, None]))
     return moved, session.table, bias + course[-1], bias, time[-1]
@@ -113,13 +114,15 @@ def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third
     np.testing.assert_allclose(ref_start - ref_end, at_start - at_end, atol=0.1 * DEG)
 
 
-def test_a_drift_that_has_not_settled_is_applied_as_its_mean_and_proven_on_all_windows():
+@pytest.mark.parametrize('name, size, time_constant', [('gyro_bias_drift', 1.5 * DEG, 400.0), ('gyro_bias_trend', 0.4 * DEG, np.inf)])
+def test_a_drift_that_has_not_settled_is_applied_as_its_mean_and_proven_on_all_windows(name, size, time_constant):
     """Its value at the end holds neither afterwards nor in a session that repeats it."""
-    samples, table, at_end, at_start, duration = drifting(size=1.5 * DEG, time_constant=400.0)
+    samples, table, at_end, at_start, duration = drifting(size, time_constant)
     calibration = imu.calibrate(samples, table).calibration
     entry, = calibration.statistics['uncorrected']
-    assert (entry['effect'], entry['applied']) == ('gyro_bias_drift', MEAN)
-    course = -1.5 * DEG * np.expm1(-np.linspace(0.0, duration, 1000) / 400.0)
+    assert (entry['effect'], entry['applied']) == (name, MEAN)
+    time = np.linspace(0.0, duration, 1000)
+    course = -size * np.expm1(-time / time_constant) if np.isfinite(time_constant) else size * time / duration
     np.testing.assert_allclose(calibration.value('gyroscope', 'bias'), at_start + course.mean(), atol=0.03 * course[-1])
     np.testing.assert_allclose(entry['rms'], course.std(), rtol=0.1)
     assert calibration.proof['gyroscope']['windows'] > 0.5 * sum(calibration.statistics['windows'].values())

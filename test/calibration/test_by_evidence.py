@@ -207,6 +207,13 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
     assert faint.sd[place] > 5 * asked.calibration.sd[was]
 
 
+def test_an_effect_that_is_removed_as_faint_leaves_an_unexplained_residual(monkeypatch):
+    monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
+    session = make_session(5, {'accel_quadratic': 2e-4}, 'realistic')
+    found = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration.statistics
+    assert found['denied'] == ['accel_quadratic'] and 2e-3 < found['unexplained']['accelerometer']['rms'] < 2e-2
+
+
 def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
     """Three quarters of a response to the cube of a force look like one to the force: with a formula for the cube that name is in no model."""
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *some: True)   # another guard, which sees to it here too

@@ -39,6 +39,7 @@ HIDDEN = {
     'gyro_g_sensitivity': lambda f, w, t, k: (NOTHING, f @ np.array([[0, 3, 0], [-4, 0, 2], [0, 0, 5]]).T * 1e-4),
     'gyro_quadratic': lambda f, w, t, k: (NOTHING, np.array([8e-3, -6e-3, 7e-3]) * w**2),
     'gyro_scale_asymmetry': lambda f, w, t, k: (NOTHING, np.array([1.2e-2, -1e-2, 1e-2]) * np.abs(w)),
+    'gyro_bias_trend': lambda f, w, t, k: (NOTHING, np.outer(t, [2e-3 * DEG, -1.5e-3 * DEG, 1e-3 * DEG])),
     'gyro_bias_drift': lambda f, w, t, k: (NOTHING, np.outer(-np.expm1(-t / 30), [0.3 * DEG, -0.2 * DEG, 0.25 * DEG])),
 }
 """What each cause adds to the accelerometer and to the gyroscope, from the true force, rate, time and number of the pose."""
@@ -69,14 +70,14 @@ def responding():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize('name', ['accel_bias_drift', 'accel_quadratic', 'gyro_bias_drift', 'gyro_g_sensitivity'])
+@pytest.mark.parametrize('name', ['accel_bias_drift', 'accel_quadratic', 'gyro_bias_drift', 'gyro_bias_trend', 'gyro_g_sensitivity'])
 def test_a_hidden_effect_is_found_and_its_gain_measured(name, responding):
     found = (responding if name == 'gyro_g_sensitivity' else diagnosed(31, HIDDEN[name], n_poses=36)).diagnosis
     assert found.findings, [(c.effect, c.gain_alone, c.p_value_alone, c.verdict) for c in found.candidates[:4]]
     first = found.findings[0]
     assert name in (first.effect, *first.indistinguishable_from)
     assert first.gain.ci95[0] > 0 and first.gain.windows >= 23
-    assert first.gain.of == (OF_MODEL if name.endswith('drift') else APPLIED)   # a drift is replaced by its value at the end
+    assert first.gain.of == (OF_MODEL if name.endswith(('drift', 'trend')) else APPLIED)   # a drift is replaced by its value at the end
     assert len(found.findings) == 1
 
 

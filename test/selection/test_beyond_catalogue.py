@@ -27,7 +27,7 @@ from worlds.hiding import record
 from worlds.physics_beyond import Beyond
 
 FEW = ('accel_quadratic', 'accel_cubic', 'accel_bias_drift', 'accel_thermal_bias', 'gyro_g_sensitivity', 'gyro_quadratic', 'gyro_bandwidth', 'gyro_bias_drift',
-       'gyro_thermal_bias', 'gyro_thermal_scale', 'time_offset', 'load_compliance')
+       'gyro_thermal_bias', 'accel_thermal_bias_2', 'gyro_thermal_bias_2', 'gyro_thermal_scale', 'time_offset', 'load_compliance')
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
 

@@ -16,6 +16,7 @@ EFFECTS = {
     'accel_quadratic': (1e-3 / G, (3,)), 'accel_cubic': (2e-3 / G**2, (3,)), 'accel_scale_asymmetry': (1e-3, (3,)),
     'accel_cross_product': (1e-3 / G, (3, 3)), 'accel_size_effect': (8e-3, (3, 3)), 'lever_arm': (10e-3, (3,)),
     'accel_thermal_bias': (0.3 * MG, (3,)), 'accel_thermal_scale': (3e-4, (3,)), 'accel_bias_drift': (2 * MG, None),
+    'accel_bias_trend': (2 * MG / 300, (3,)), 'gyro_bias_trend': (0.05 * DEG / 300, (3,)),
     'accel_saturation': (0.02, None), 'accel_bandwidth': (4e-3, None),
     'accel_thermal_bias_2': (0.05 * MG, (3,)), 'gyro_thermal_bias_2': (2e-3 * DEG, (3,)), 'gyro_force_squared': (5e-3 * DEG / G**2, (3, 6)),
     'accel_thermal_hysteresis': (2 * MG, (3,)), 'gyro_thermal_hysteresis': (0.05 * DEG, (3,)), 'accel_delay': (4e-3, None), 'gyro_delay': (4e-3, None), 'accel_filter': (4e-3, None), 'gyro_filter': (4e-3, None),
@@ -88,6 +89,7 @@ def draw_imu(grade, values, arms, rng):
         triad.thermal_scale = values.get(short + '_thermal_scale', 0.0)
         triad.low_pass, triad.late = float(values.get(short + '_bandwidth', 0.0)), float(values.get(short + '_delay', 0.0))
         triad.second_order, triad.crosstalk = float(values.get(short + '_filter', 0.0)), values.get(short + '_cross_axis_lag')
+        triad.trend = values.get(short + '_bias_trend', 0.0)
         if short + '_bias_drift' in values:
             triad.drift, triad.drift_constant = values[short + '_bias_drift'][:3], values[short + '_bias_drift'][3]
     accel.cubic = values.get('accel_cubic', 0.0)

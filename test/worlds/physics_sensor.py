@@ -40,6 +40,8 @@ class Triad:
     drift: np.ndarray | float = 0.0
     drift_constant: float = 1.0
     """Bias warm-up: drift (1 - exp(-t / constant))."""
+    trend: np.ndarray | float = 0.0
+    """Change of the bias per second."""
     low_pass: float = 0.0
     """Time constant of the filter behind the elements, s."""
     low_pass_order: int = 1
@@ -76,7 +78,8 @@ class Triad:
             along = inputs[i] @ (self.matrix[i] / scale)
             output[:, i] = (_of(self.bias, i) + scale * (1.0 + _of(self.thermal_scale, i) * warm) * along
                             + _of(self.quadratic, i) * along**2 + _of(self.cubic, i) * along**3 + _of(self.asymmetry, i) * np.abs(along)
-                            + _of(self.thermal_bias, i) * warm + _of(self.thermal_bend, i) * warm**2 + _of(self.hysteresis, i) * strained - _of(self.drift, i) * np.expm1(-time / self.drift_constant))
+                            + _of(self.thermal_bias, i) * warm + _of(self.thermal_bend, i) * warm**2 + _of(self.hysteresis, i) * strained - _of(self.drift, i) * np.expm1(-time / self.drift_constant)
+                            + _of(self.trend, i) * time)
             if self.products is not None:
                 x, y, z = inputs[i].T
                 output[:, i] += self.products[i, 0] * x * y + self.products[i, 1] * y * z + self.products[i, 2] * x * z
