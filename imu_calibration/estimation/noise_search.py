@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from imu_calibration.estimation.noise_model import BiasProcess, dof_factor, means_beside_middles
-from imu_calibration.estimation.whitening import RestrictedLikelihood, profile
+from imu_calibration.estimation.whitening import RestrictedLikelihood, eliminate, profile
 
 SCORING_STEPS = 2
 """Scoring steps per call; for rows of one variance a single step is exact."""
@@ -164,12 +164,15 @@ class NoiseLikelihood:
         Processes that are always included.
     durations : ndarray, shape (n,), optional
         Lengths of the windows, s.
+    common : int
+        The first parameters, which are part of every choice: eliminated once per shape.
 
     """
 
     def __init__(self, rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, sessions: list[np.ndarray],
-                 information: np.ndarray | None = None, known: tuple[BiasProcess, ...] = (), durations: np.ndarray | float = 0.0):
-        self._durations = np.broadcast_to(durations, len(rows))
+                 information: np.ndarray | None = None, known: tuple[BiasProcess, ...] = (), durations: np.ndarray | float = 0.0,
+                 common: int = 0):
+        self._common, self._durations = common, np.broadcast_to(durations, len(rows))
         self.typical = float(np.sqrt(np.median(white)))
         self.many, self.known = len(rows) >= MIN_PROCESS_WINDOWS, known
         self._rows, self._white, self._times, self._sessions = rows, white, times, sessions
@@ -177,17 +180,19 @@ class NoiseLikelihood:
         self._profiles = {}
 
     def loss(self, shape: tuple, used: Sequence[int] | np.ndarray | None = None, *, session: float = 0.0) -> float:
-        """Return minus twice the restricted log likelihood with the parameters `used`, by default all."""
+        """Return minus twice the restricted log likelihood with the parameters `used`, counted after the common ones, by default all."""
         key = (*map(float, shape), float(session))
         if key not in self._losses:
             offset, bias, time, step = np.multiply(key, (self.typical, self.typical, 1.0, self.typical))
             processes = self.processes(bias, time)
             within = means_beside_middles(processes, self._durations)[:, None]
-            self._losses[key] = self._likelihood.whitened(self._white + within + offset**2, processes, step**2)
+            logs, normal = self._likelihood.whitened(self._white + within + offset**2, processes, step**2)
+            of_common, normal = eliminate(normal, self._common)
+            self._losses[key] = logs + of_common, normal
         logs, normal = self._losses[key]
         choice = (key, None if used is None else tuple(used))
         if choice not in self._profiles:
-            at = np.arange(len(normal)) if used is None else np.r_[used, len(normal) - 1]
+            at = np.arange(len(normal)) if used is None else [*used, len(normal) - 1]
             self._profiles[choice] = logs + profile(normal[np.ix_(at, at)])
         return self._profiles[choice]
 
@@ -199,7 +204,7 @@ class NoiseLikelihood:
         variance = self._white[:, others] + means_beside_middles(processes, self._durations)[:, None] + offset**2
         information = self._likelihood.of_axes(others).whitened(variance, processes)[1]
         return NoiseLikelihood(self._rows[:, [axis]], self._white[:, [axis]], self._times, sessions=self._sessions, information=information,
-                               known=self.known, durations=self._durations)
+                               known=self.known, durations=self._durations, common=self._common)
 
     def processes(self, sd: float, time: float) -> tuple[BiasProcess, ...]:
         """Return the known processes plus one more (or the flicker processes) if its standard deviation is above zero."""

@@ -224,12 +224,20 @@ class RestrictedLikelihood:
         return 0.5 * weighted @ (rest**2 - redundancy), 0.5 * weighted @ (np.eye(len(left)) - left @ left.T)**2 @ weighted.T
 
 
+def eliminate(normal: np.ndarray, count: int) -> tuple[float, np.ndarray]:
+    """Return ``log|A|`` and the Schur complement ``C - B' A^-1 B`` of a normal matrix ``[[A, B], [B', C]]``, A its first `count` rows."""
+    if not count:
+        return 0.0, normal
+    scale = np.sqrt(np.maximum(np.diag(normal)[:count], 1e-300))
+    scaled = normal[:count, :count] / np.outer(scale, scale)
+    scaled.flat[::count + 1] += JITTER
+    factor = np.linalg.cholesky(scaled)
+    solved = lapack.dtrtrs(factor, normal[:count, count:] / scale[:, None], lower=1)[0]
+    logs = 2 * np.log(np.diag(factor)).sum() + 2 * np.log(scale).sum()
+    return float(logs), normal[count:, count:] - solved.T @ solved
+
+
 def profile(normal: np.ndarray) -> float:
     """Return ``y'y - b' A^-1 b + log|A|`` of the normal matrix ``[[A, b], [b', y'y]]``."""
-    scale = np.sqrt(np.maximum(np.diag(normal)[:-1], 1e-300))
-    scaled = normal[:-1, :-1] / np.outer(scale, scale)
-    scaled.flat[::len(scaled) + 1] += JITTER
-    factor = np.linalg.cholesky(scaled)
-    solved = lapack.dtrtrs(factor, normal[:-1, -1] / scale, lower=1)[0]
-    logs = 2 * np.log(np.diag(factor)).sum() + 2 * np.log(scale).sum()
-    return logs + normal[-1, -1] - solved @ solved
+    logs, left = eliminate(normal, len(normal) - 1)
+    return logs + float(left[0, 0])

@@ -155,7 +155,9 @@ def _with_moving_factors(space, sensor, noise, values, look_along):
 
 def _with_bias_process(space, sensor, noise, smooth):
     """Return the noise of a sensor with window offsets and bias process, estimated with all effects but the superfluous smooth ones."""
-    own, recording = np.unique(np.concatenate(space.index[sensor])), space.recording
+    recording, superfluous = space.recording, sorted({k for parameters in smooth for k in parameters})
+    structural = np.setdiff1d(np.concatenate(space.index[sensor]), superfluous)
+    own = np.append(structural, superfluous).astype(int)
     place = {parameter: k for k, parameter in enumerate(own)}
     rows = np.zeros((len(recording.windows), 3, len(own) + 1))
     for axis in range(3):
@@ -163,13 +165,12 @@ def _with_bias_process(space, sensor, noise, smooth):
     white = noise[sensor].mean_variance(recording.kind, recording.count, recording.duration, keys=recording.keys)
     likelihood = NoiseLikelihood(rows, white, recording.time, sessions=recording.sessions,
                                  information=_known_otherwise(space, sensor, noise, own),
-                                 known=noise[sensor].known, durations=recording.duration)
+                                 known=noise[sensor].known, durations=recording.duration, common=len(structural))
     natural = float(np.sqrt(sum(process.sd**2 for process in natural_processes(noise[sensor], recording.period))))
     search = BiasProcessSearch(likelihood, 0.0 if noise[sensor].known else natural, STABLE[sensor])
-    options = [[place[k] for k in parameters] for parameters in smooth]
-    structural = [k for k in range(len(own)) if not any(k in option for option in options)]
-    prior_sd = drift_prior(rows[:, :, :-1], space.prior_sd[own], max(natural, STABLE[sensor]))
-    used = structural + _needed_smooth(search, structural, options, prior_sd=prior_sd)
+    options = [[place[k] - len(structural) for k in parameters] for parameters in smooth]
+    prior_sd = drift_prior(rows[:, :, len(structural):-1], space.prior_sd[superfluous], max(natural, STABLE[sensor]))
+    used = _needed_smooth(search, options, prior_sd=prior_sd)
     shape = search.best(used)[0]
     middle = search.of_middle_axis(shape, used) if shape[1] > PLAUSIBLE * search.usual else 0.0
     return replace(noise[sensor], middle_wander=middle, **search.polished(shape, used))
@@ -195,15 +196,15 @@ def drift_prior(columns: np.ndarray, prior_sd: np.ndarray, usual: float) -> np.n
     return np.minimum(prior_sd, MAX_DRIFT_RATIO * usual / np.maximum(spread, 1e-300))
 
 
-def _needed_smooth(search, structural, options, *, prior_sd):
+def _needed_smooth(search, options, *, prior_sd):
     """
     Return the parameters of the smooth effect that beats the bias process, each with the noise estimated jointly.
 
     By restricted likelihood, all parameters integrated out under their priors: at its maximum over as many as there are windows the wander
     is underestimated, and noise of 15 s resembles a drift.
     """
-    losses = [search.best(structural)[1]]
-    losses += [search.best(structural + option)[1] + 2 * np.log(prior_sd[option]).sum() + STRONG for option in options]
+    losses = [search.best([])[1]]
+    losses += [search.best(option)[1] + 2 * np.log(prior_sd[option]).sum() + STRONG for option in options]
     return ([[]] + options)[int(np.argmin(losses))]
 
 

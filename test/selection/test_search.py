@@ -449,8 +449,8 @@ def test_a_wander_far_beyond_the_natural_one_has_its_price():
 def test_what_is_smooth_in_time_has_to_beat_the_wander_of_the_bias():
     """Three parameters whose priors are ten wide win three units of likelihood by chance; 14 are what the priors cost, 10 are very strong evidence."""
     for won, needed in ((3.0, []), (22.0, []), (26.0, [7, 8, 9])):
-        search = SimpleNamespace(best=lambda used, won=won: (None, 100.0 - won * (len(used) > 2)))
-        assert _needed_smooth(search, [0, 1], [[7, 8, 9]], prior_sd=np.full(10, 10.0)) == needed
+        search = SimpleNamespace(best=lambda used, won=won: (None, 100.0 - won * (len(used) > 0)))
+        assert _needed_smooth(search, [[7, 8, 9]], prior_sd=np.full(10, 10.0)) == needed
 
 
 @pytest.mark.parametrize(('apart', 'agree'), ((2.0, True), (6.0, False)))
