@@ -117,7 +117,7 @@ class Evidence:
     def _heldout(self, used):
         places, left = np.append(used, -1), self._left_by_others(used)
         folds = self.total[np.ix_(places, places)] - self.without[:, places[:, None], places]
-        return float(np.einsum('fi,fij,fj->', left, folds, left))
+        return float(_squares(folds[None], left)[0])
 
     def _left_by_others(self, used):
         """Return for each fold the map from rows of `used`, sorted, to residuals of the fit to all other folds, shape (n_folds, n + 1)."""
@@ -236,7 +236,7 @@ class WindowEvidence(Evidence):
 
 def _squares(parts, rows):
     """Return residual sums of squares from normal matrices of folds, shape (p, f, n, n), and residual vectors (f, n), shape (p,)."""
-    return np.einsum('fi,pfij,fj->p', rows, parts, rows)
+    return ((parts @ rows[:, :, None])[..., 0] * rows).sum(axis=(1, 2))
 
 
 DISAGREE = 1e-4

@@ -42,7 +42,7 @@ class Score:
     p_value: float
     """Chi-square p-value times the number of effects under test, at most 1."""
     allowed: bool
-    """Whether the estimate is physically possible."""
+    """Whether the estimate is physically possible; evaluated for an effect with evidence only."""
     implausible: bool = False
     """Whether its size exceeds that of any known instrument."""
 
@@ -91,10 +91,10 @@ class Search:
         names = {q.name for q in chosen}.union(self.resolved)
         return [q for q in self.questions if q.name not in names]
 
-    def cost(self, chosen: Sequence[Question]) -> float:
-        """Return the held-out cost of a choice, nats, penalties included."""
-        return (0.5 * self.evidence.heldout(self.used(chosen)) + PENALTY * sum(q.penalty for q in chosen)
-                + IMPLAUSIBLE * sum(self.implausible(chosen, q) for q in chosen))
+    def cost(self, chosen: Sequence[Question], most: float = np.inf) -> float:
+        """Return the held-out cost of a choice, nats, penalties included; above `most` without the penalty for implausible sizes."""
+        cost = 0.5 * self.evidence.heldout(self.used(chosen)) + PENALTY * sum(q.penalty for q in chosen)
+        return cost if cost > most else cost + IMPLAUSIBLE * sum(self.implausible(chosen, q) for q in chosen)
 
     def score(self, chosen: Sequence[Question], question: Question) -> Score:
         """Return the Score of one more effect."""
@@ -102,7 +102,8 @@ class Search:
         smaller, larger = self.used(chosen), self.used(beside)
         gain = 0.5 * (self.evidence.heldout(smaller) - self.evidence.heldout(larger))
         p_value = min(1.0, self.evidence.p_value(smaller, larger) * len(self.questions))
-        return Score(question, gain, p_value, self.allowed(beside, question), self.implausible(beside, question))
+        asked = p_value < FAMILY_WISE and gain > 0
+        return Score(question, gain, p_value, asked and self.allowed(beside, question), asked and self.implausible(beside, question))
 
     def allowed(self, chosen: Sequence[Question], question: Question) -> bool:
         """
@@ -203,7 +204,7 @@ class Search:
                 if other is question:
                     continue
                 trial = [*chosen[:place], other, *chosen[place + 1:]]
-                value = self.cost(trial)
+                value = self.cost(trial, cost)
                 if value < cost and all(self.allowed(trial, each) for each in trial) and self.score(rest, other).significant:
                     best, cost = trial, value
         return best
@@ -221,7 +222,7 @@ class Search:
         found = {}
         for other in self.others(chosen):
             trial = [*chosen[:place], other, *chosen[place + 1:]]
-            difference = self.cost(trial) - cost
+            difference = self.cost(trial, cost + TIE) - cost
             if question.effect.contained_in == other.name:
                 continue  # a special case with an equal fit is preferred, and the general effect is not its rival
             if difference < TIE and self.allowed(trial, other):
