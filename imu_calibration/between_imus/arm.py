@@ -303,12 +303,6 @@ def _products(integrate, rate):
     return integrate((rate[:, :, None] * rate[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
 
 
-def _rotation_covariance(fit, rows, rotation):
-    """Contribution of the uncertainty of the rotation between the IMUs."""
-    shift = response(fit, -skew(rows.force))
-    return (shift @ rotation.cov @ shift.T)[:3, :3]
-
-
 def _calibration_covariance(fit, rows, a, b):
     """Contribution of the uncertainty of the gyroscopes' matrices: ``rate -> (1 - E) rate`` with the sd of E."""
     columns = []
@@ -332,7 +326,8 @@ def _matrix_covariance(calibration):
 
 def _result(rows, fit, delay, rotation, streams):
     motion = jackknife_covariance(fit, rows.centres, CLUSTER)[:3, :3]
-    calibration, turned = _calibration_covariance(fit, rows, *streams), _rotation_covariance(fit, rows, rotation)
+    shift = response(fit, -skew(rows.force))
+    calibration, turned = _calibration_covariance(fit, rows, *streams), (shift @ rotation.cov @ shift.T)[:3, :3]
     total = motion + calibration + turned
     sd = np.sqrt(np.diag(total))
     _require_seen(fit.seen, sd)

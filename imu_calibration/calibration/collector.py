@@ -91,7 +91,7 @@ def _arrays_of(accumulator, label):
     rows = accumulator.rows
     arrays = {f'{label}rows': np.array([(row.time, row.duration, row.encoder_step) for row in rows], float).reshape(-1, 3),
               f'{label}whole': np.array([(row.count, row.session) for row in rows], np.int64).reshape(-1, 2)}
-    for sensor in _sensors(rows):
+    for sensor in sorted(rows[0].sensors) if rows else []:
         for name in ('mean', 'noise_variance', 'inflation'):
             arrays[f'{label}{sensor}.{name}'] = np.array([getattr(row.sensors[sensor], name) for row in rows])
     for name in ('within', 'slow'):
@@ -203,10 +203,6 @@ def _outline(block):
 def _block(outline, label, arrays):
     within, slow = ({tuple(key): arrays[f'{label}.{name}.{k}'] for k, key in enumerate(outline[name])} for name in ('within', 'slow'))
     return WindowBlock(outline['session'], outline['start'], outline['windows'], within, slow)
-
-
-def _sensors(rows):
-    return sorted(rows[0].sensors) if rows else []
 
 
 class Collector:

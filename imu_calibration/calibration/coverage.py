@@ -179,7 +179,9 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     """
     solution = result.solution
     wanted = np.array(result.model.requested, bool)
-    base = solution.information + _known_before(solution.model)
+    prior = make_prior(solution.model)
+    gauge = GAUGE_SD / GAUGE_SHOWN * prior.gauge   # as exact as sums of squares bear it
+    base = solution.information + np.diag(1 / prior.sd**2) + gauge.T @ gauge
 
     def expected_sd(information):
         return np.sqrt(np.clip(np.diag(inverse_normal(information)), 0, None))
@@ -196,13 +198,6 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     first, seconds = _foretold(base, left, added, _possible_motions(result.table))
     step = _next_on_table(result) if first is None else _step(first.text)
     return Coverage(worth, _rests_of(result), None, step, seconds, (), _arms(result), frame_id)
-
-
-def _known_before(model):
-    """Return the information of the prior; the gauge as exact as sums of squares bear it."""
-    prior = make_prior(model)
-    gauge = GAUGE_SD / GAUGE_SHOWN * prior.gauge
-    return np.diag(1 / prior.sd**2) + gauge.T @ gauge
 
 
 def _possible_motions(table):

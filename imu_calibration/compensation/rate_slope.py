@@ -187,7 +187,9 @@ class RateSlope:
         """Return the size of the derivative, from rates, or from the derivative in use."""
         if self.derivative is not None and len(rates):
             return SlopeError(_moment(rates), float(self.derivative.weights @ self.derivative.weights))
-        period = _mean_step(list(self._stamps)[-len(rates):])
+        step = np.diff(np.array(list(self._stamps)[-len(rates):], np.int64))
+        step = step[np.abs(step) <= PAUSE_NS]
+        period = max(float(step.mean()) * 1e-9, 0.0) if len(step) else 0.0
         if len(rates) < 3 or not period:
             return SlopeError()
         lag = int(min(max(round(ROUGH / period), 1), len(rates) - 2))
@@ -276,13 +278,6 @@ def _usual(stamps: np.ndarray, period_ns: float) -> np.ndarray:
     step = np.diff(stamps, axis=-1)
     within = np.all(stamping.is_regular(step, period_ns), axis=-1)
     return within & (np.abs((stamps[..., -1] - stamps[..., 0]) / (period_ns * max(step.shape[-1], 1)) - 1) <= CHANGED[REGULAR])
-
-
-def _mean_step(stamps: list[int]) -> float:
-    """Return the mean step between stamps without pauses, s; 0.0 where there is none."""
-    step = np.diff(np.array(stamps, np.int64))
-    step = step[np.abs(step) <= PAUSE_NS]
-    return max(float(step.mean()) * 1e-9, 0.0) if len(step) else 0.0
 
 
 def _moment(rows: np.ndarray) -> np.ndarray:

@@ -203,10 +203,12 @@ def parts_of(document: Mapping) -> dict[str, Any]:
         if not np.all(_shaped(entry.get('sd', np.zeros(effect.shape)), effect) >= 0):
             raise DocumentError(f"the standard deviations of '{effect.name}' must not be negative, some are or are no numbers; "
                                 "calibrate again", code='negative_sd')
+    terms = document.get('covariance_terms') or {}
+    order = [document['covariance']['names'].index(name) for name in model.param_names] if terms else []
     return {'model': replace(model.at(values), centre=_centre(model, entries)), 'values': values,
             'covariance': _covariance(document.get('covariance'), model, entries),
             'status': tuple(status), 'frame_id': document.get('frame_id', ''),
-            'covariance_terms': _covariance_terms(document, model),
+            'covariance_terms': {str(name): np.asarray(variance, float)[order] for name, variance in terms.items()},
             'held_reason': {name: str(reason) for e in model.effects if 'held_reason' in entries[e.key] for name, reason in zip(
                 e.param_names(), np.array(entries[e.key]['held_reason'], dtype=object).reshape(e.size), strict=True) if reason},
             'undetermined': tuple(document.get('undetermined_directions') or ()), 'notes': tuple(document.get('notes') or ()),
@@ -261,13 +263,6 @@ def _centre(model, entries):
             raise DocumentError(f'the centre {shortened(repr(name))} must have one finite number for each column of its effect; '
                                 'correct the calibration file', code='centre')
     return found
-
-
-def _covariance_terms(document, model):
-    """Return term -> variance of each parameter in the model's order; the document has the order of its covariance."""
-    terms = document.get('covariance_terms') or {}
-    order = [document['covariance']['names'].index(name) for name in model.param_names] if terms else []
-    return {str(name): np.asarray(variance, float)[order] for name, variance in terms.items()}
 
 
 def _covariance(given, model, entries):

@@ -321,7 +321,9 @@ def amplitude_coefficients(effect: Effect, values: Values, point: dict[str, Any]
 
 def along_axis_coefficients(effect: Effect, values: Values, point: dict[str, Any], *, function: Callable) -> Values:
     """Return values before a function of the input along each element's own axis; ``function(input axes)`` gives one of each."""
-    return {effect.groups[0].name: function(input_axes(values)) * values[effect.name][None, :]}
+    matrix = values['matrix'].reshape(3, 3)
+    input_axes = matrix / np.sqrt((matrix**2).sum(axis=1))[:, None]
+    return {effect.groups[0].name: function(input_axes) * values[effect.name][None, :]}
 
 
 def product_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
@@ -347,9 +349,3 @@ def lever_coefficients(effect: Effect, values: Values, point: dict[str, Any]) ->
     """Return the coefficients of the lever matrix W_jk for output i: m_ij r_ik (Zhang 2017, eq. 11-17 with the true inverse)."""
     matrix, arms = values['matrix'].reshape(3, 3), np.broadcast_to(values[effect.name].reshape(-1, 3), (3, 3))   # one arm for all three
     return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}
-
-
-def input_axes(values: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the unit vectors along which the three sensing elements sense: rows of the matrix, normalised."""
-    matrix = values['matrix'].reshape(3, 3)
-    return matrix / np.sqrt((matrix**2).sum(axis=1))[:, None]

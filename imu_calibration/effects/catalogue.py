@@ -97,9 +97,10 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
     if settles:
         shape = {'components': (*VECTOR, 'time_constant'), 'shape': (4,), 'unit': (*[unit] * len(AXES), 's'), 'time_constant': True,
                  'prior': (0.0, 0.0, 0.0, time_constant), 'prior_sd': (spread, spread, spread, 10 * time_constant / 3)}
+    text = text.strip() or f'The {sensor} output follows {", ".join(columns)}'
     return Effect(
         name=name, sensor=sensor, **shape, tolerance=tolerance, tolerance_reason=tolerance_reason,
-        explanation=_explanation(text, sensor, columns), needs=needs,
+        explanation=text if text.endswith(('.', '!', '?')) else f'{text}.', needs=needs,
         motion=next((motions for quantity, motions in QUANTITY_MOTIONS if quantity in group.uses), ('static_poses',)),
         compensation='none' if group.uses & {'time', 'attitude', *JOINT_INPUTS} else 'exact', groups=(group,),
         coefficients=partial(amplitude_coefficients, own_axis=len(columns) == 3),
@@ -107,12 +108,6 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
         plausible=(('such', largest, 'its definition'),) if largest else (),
         definition={key: value for key, value in definition.items() if value is not None},
         against=tuple(drawn for quantity, drawn in DRAWN_AGAINST.items() if quantity in group.uses)[:1])
-
-
-def _explanation(text, sensor, columns):
-    """Return the text as a sentence; without text, a sentence with its columns."""
-    text = text.strip() or f'The {sensor} output follows {", ".join(columns)}'
-    return text if text.endswith(('.', '!', '?')) else f'{text}.'
 
 
 def from_definition(name: str, definition: dict[str, Any]) -> Effect:

@@ -135,12 +135,6 @@ def block_scores(system: WeightedSystem, values: np.ndarray, noises: dict[str, N
     return information, gradient
 
 
-def slow_cosines(count: int) -> np.ndarray:
-    """Return the weights of `count` parts in each cosine, the slowest first, shape (k, count)."""
-    number = np.arange(1, min(MOST_WAVES, count - 1) + 1)
-    return np.sqrt(2) * np.cos(np.pi * number[:, None] * (np.arange(count) + 0.5) / count)
-
-
 def model_error_of_rows(rows: RowSet, found: RowEstimate, model: SensorModel, *, block: np.ndarray) -> ModelError:
     """
     Return the model error from the scatter of parameters between blocks of rows, beyond noise and known scatter.
@@ -173,7 +167,10 @@ def _waves_of_blocks(information, gradient, prior_root, free, shared=None):
     """Return the Waves of parts with their own information and gradient; `shared`: products of their fitted nuisances with the design."""
     information, gradient = information[:, free][:, :, free], gradient[:, free]
     covariance = inverse_normal(information.sum(axis=0) + prior_root[:, free].T @ prior_root[:, free])
-    weights = slow_cosines(len(information))
+    # Weights of the blocks in each cosine, the slowest first.
+    count = len(information)
+    number = np.arange(1, min(MOST_WAVES, count - 1) + 1)
+    weights = np.sqrt(2) * np.cos(np.pi * number[:, None] * (np.arange(count) + 0.5) / count)
     mixed = np.einsum('kc,cij->kij', weights, information)
     squared = np.einsum('kc,cij->kij', weights**2, information)
     expected = squared - mixed @ covariance @ mixed

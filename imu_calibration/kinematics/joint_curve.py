@@ -209,7 +209,7 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
     """
     time, position = np.asarray(time, float), np.asarray(position, float)
     _check(time, position)
-    position = _unwrapped(position)
+    position = np.unwrap(position, axis=0) if np.any(np.abs(np.diff(position, axis=0)) > np.pi) else position
     stamps = time[np.concatenate([[True], np.diff(time) > 0])]
     knots = _place_knots(stamps)
     still = np.all(position == position[0], axis=0)
@@ -240,10 +240,6 @@ def _check(time, position):
     if np.any(np.diff(time) < 0):
         raise InputError('joint stamps must not run backwards, got a backward step; sort the readings or drop those',
                          code='stamps_backwards')
-
-
-def _unwrapped(position):
-    return np.unwrap(position, axis=0) if np.any(np.abs(np.diff(position, axis=0)) > np.pi) else position
 
 
 def _place_knots(time):

@@ -172,7 +172,10 @@ class PenalisedSpline:
         self._interior = interior / interior.sum()
         self.density = self.n_rows / self.n_coefficients
         self._mean_bands = bands.sum(axis=1) / self.n_coefficients * np.where(np.arange(SPLINE_ORDER) == 0, 1.0, 2.0)
-        self.least_decade = self._least_decade()
+        # The smallest penalty for which the factor exists: holes of m knots give it eigenvalues of about (pi / m)^6.
+        empty = self.bands[0] < 1e-9 * self.density
+        hole = np.max(np.diff(runs_of(empty)), initial=0) + SPLINE_ORDER
+        self.least_decade = max(_COARSE[0], 6 * np.log10(hole / np.pi) - 13)
         self._gains = {}
         self._theta = (np.arange(512) + 0.5) * np.pi / 512
         self._symbols = self.symbols(self._theta)
@@ -189,12 +192,6 @@ class PenalisedSpline:
                                      overwrite_b=True, check_finite=False)
         residual = values - self.design @ coefficients
         return coefficients, np.einsum('i,ij,ij->j', self._interior, residual, residual)
-
-    def _least_decade(self):
-        """Return the smallest penalty (decade) for which the factor exists: holes of m knots give it eigenvalues of about (pi / m)^6."""
-        empty = self.bands[0] < 1e-9 * self.density
-        hole = np.max(np.diff(runs_of(empty)), initial=0) + SPLINE_ORDER
-        return max(_COARSE[0], 6 * np.log10(hole / np.pi) - 13)
 
     def _end_weights(self, penalty):
         """

@@ -64,7 +64,9 @@ class CompensatorNode(Node):
         self._mark = self.create_publisher(String, self._publisher.topic_name + MARK, latched_qos())
         group = relay_loop.OutsideExecutor() if self.by_wait_set else None
         self.imu = MatchedInput(self, Imu, 'imu/data_raw', callback=self._on_imu, group=group)
-        self._refuse_own_output()
+        if self.imu.topic_name == self._publisher.topic_name:
+            raise InputError(f'input and output must be two topics, both are {self.imu.topic_name}; correct the remapping')
+        refuse_corrected(self.imu.topic_name)
         self.documents = MatchedInput(self, String, 'imu/calibration', callback=self._guarded(self._on_document), raw=False, latched=True)
         self.temperature: MatchedInput | None = None
         self.inputs = [self.imu, self.documents]
@@ -276,11 +278,6 @@ class CompensatorNode(Node):
         topic = self.imu.topic_name
         self.corrected_already = (f'{topic} is corrected already ({topic + MARK} has a publisher): no messages are published; '
                                   'remap imu/data_raw to the raw topic') if self.count_publishers(topic + MARK) else ''
-
-    def _refuse_own_output(self) -> None:
-        if self.imu.topic_name == self._publisher.topic_name:
-            raise InputError(f'input and output must be two topics, both are {self.imu.topic_name}; correct the remapping')
-        refuse_corrected(self.imu.topic_name)
 
 
 def main(arguments: list[str] | None = None) -> int:

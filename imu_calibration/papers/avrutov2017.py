@@ -184,14 +184,9 @@ def _axis_turn(axis, angle):
     return matrix
 
 
-def _base_axes(gravity_axis):
-    index = 'xyz'.index(gravity_axis)
-    return np.roll(np.eye(3), -index, axis=0)
-
-
 def tilted_gravity(gravity_axis: str, tilt_rad: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return the unit gravity reaction in the base frame, shape (3,); `tilt_rad` are its components along the next two axes."""
-    up, first, second = _base_axes(gravity_axis)
+    up, first, second = np.roll(np.eye(3), -'xyz'.index(gravity_axis), axis=0)
     return np.sqrt(1 - np.dot(tilt_rad, tilt_rad)) * up + tilt_rad[0] * first + tilt_rad[1] * second
 
 

@@ -341,7 +341,10 @@ def _best_shift(windows, table):
     middle, lag = RESOLVED * most, int(RESOLVED * LEAST_SHIFT / period)
     near = np.abs(shares[middle - lag:middle + lag + 1])
     place = int(np.argmax(near)) + middle - lag
-    best = _nearest_peak(shares, middle)
+    # The nearest peak to zero delay among those within SHARE_TIE of the highest: periodic motion has many.
+    inner = shares[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= shares[:-2]) & (inner >= shares[2:]) & (inner >= shares.max() - SHARE_TIE))
+    best = int(peaks[np.argmin(np.abs(peaks - middle))]) if len(peaks) else int(np.argmax(shares))
     other = shares[middle + lag + 1:] if best < middle else shares[:max(middle - lag, 0)]
     twin = 0 < place - middle + lag < 2 * lag and shares[best] < 1.0 - SHARE_TIE and other.max(initial=-1.0) > shares[best] - SHARE_TIE
     return _Shift((best - middle) * period / RESOLVED, float(shares[best]), float(shares[place]), bool(twin))
@@ -354,10 +357,3 @@ def _correlations(first, second, most):
     shifts = np.arange(-most, most + 1)
     from scipy.interpolate import CubicSpline  # here, because its import is slow
     return CubicSpline(shifts, sums[shifts])(np.arange(-most * RESOLVED, most * RESOLVED + 1) / RESOLVED)
-
-
-def _nearest_peak(shares, middle):
-    """Return the index of the peak nearest to zero delay among peaks within SHARE_TIE of the highest: periodic motion has many."""
-    inner = shares[1:-1]
-    peaks = 1 + np.flatnonzero((inner >= shares[:-2]) & (inner >= shares[2:]) & (inner >= shares.max() - SHARE_TIE))
-    return int(peaks[np.argmin(np.abs(peaks - middle))]) if len(peaks) else int(np.argmax(shares))

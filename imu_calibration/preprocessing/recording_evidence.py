@@ -155,14 +155,11 @@ class EvidenceGatherer:
     def _take_imu(self, imu):
         columns = np.concatenate([imu.force_s.T, imu.rate_s.T])
         if self._chunks.n_samples < RESOLUTION_SAMPLES:
-            self._note_resolution(columns[:, :RESOLUTION_SAMPLES])
+            self._resolution = np.minimum(self._resolution, smallest_step(columns[:, :RESOLUTION_SAMPLES].T))
         self._chunks.push(imu.stamp_ns, columns)
         for column, (upwards, downwards) in zip(columns, self._ends):
             upwards.push(column)
             downwards.push(-column)
-
-    def _note_resolution(self, columns):
-        self._resolution = np.minimum(self._resolution, smallest_step(columns.T))
 
 
 class _Steps:

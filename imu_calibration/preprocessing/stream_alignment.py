@@ -54,17 +54,13 @@ class SampleBuffer:
             place = max(0, int(np.searchsorted(block.stamp_ns, stamp_ns)) - keep_one)
             if place:
                 kept = block.select(slice(place, None))
-                self._blocks[:1] = [_owned(kept)] if len(kept) else []
+                # A slice would keep the complete block in memory.
+                self._blocks[:1] = [type(kept).concatenate([kept])] if len(kept) else []
 
     def _joined(self):
         if len(self._blocks) > 1:
             self._blocks = [type(self._blocks[0]).concatenate(self._blocks)]
         return self._blocks[0] if self._blocks else None
-
-
-def _owned(samples):
-    """Return a copy of `samples`: a slice would keep the complete block in memory."""
-    return type(samples).concatenate([samples])
 
 
 JOINT_WAIT = 60.0

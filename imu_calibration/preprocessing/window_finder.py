@@ -131,7 +131,9 @@ class MotionGatherer:
                 self._queue[name] = [(epoch, part) for epoch, part in self._queue[name] if epoch > self._epoch]
             windows += self._cut(self._chunks.take())
             if not self._epoch_is_over():
-                self._forget_temperature()
+                queue = self._queue['temperature']   # of an epoch that the other streams do not begin
+                while len(queue) > 1 and _span(queue) > JOINT_WAIT:
+                    del queue[0]
                 return windows
             windows += self._next_epoch()
 
@@ -157,12 +159,6 @@ class MotionGatherer:
         for name in STREAMS:
             if not self._queue[name]:
                 self._epoch_shift[name] = self._epoch - self.cleaner.epoch(name)
-
-    def _forget_temperature(self):
-        """Bound the buffer of temperatures of an epoch that the other streams do not begin."""
-        queue = self._queue['temperature']
-        while len(queue) > 1 and _span(queue) > JOINT_WAIT:
-            del queue[0]
 
     def _end_epoch(self):
         return self._cut(self._chunks.take(final=True))

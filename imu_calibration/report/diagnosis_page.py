@@ -262,11 +262,7 @@ def in_type(sentence: str) -> str:
     return sentence.replace(' +- ', ' ± ').replace(' -', ' −').replace('^2', '²').replace('^3', '³')
 
 
-def _goes_with(rest):
-    share = f' ({text(100 * rest.share, 2)} % of its variance)' if rest.correlates_with and rest.share else ''
-    return (rest.correlates_with or '–') + share
-
-
 def _rest(sensor, rest):
+    share = f' ({text(100 * rest.share, 2)} % of its variance)' if rest.correlates_with and rest.share else ''
     return {'sensor': sensor, 'significant': rest.significant, 'rms': in_unit(rest.rms, rest.unit or UNITS[sensor]),
-            'sigma': text(rest.sigma, 2), 'with': _goes_with(rest)}
+            'sigma': text(rest.sigma, 2), 'with': (rest.correlates_with or '–') + share}

@@ -67,7 +67,8 @@ def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]
     kinds = {window.kind for window in windows}
     span = _temperature_span(windows)
     have = {e.key for e in model.effects}
-    turned, shaken = _branch_span(windows) >= BRANCHES_APART, _vibrates(windows)
+    branches = [float(window.motion.thermal_branch.mean()) for window in windows if window.motion.thermal_branch is not None]
+    turned, shaken = (max(branches) - min(branches) if branches else 0.0) >= BRANCHES_APART, _vibrates(windows)
     return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds, span) or _not_turned(effect, turned)
                         or _not_shaken(effect, shaken))
 
@@ -96,11 +97,6 @@ def _temperature_span(windows):
         return None
     means = [float(np.mean(window.temperature_c)) for window in windows]
     return max(means) - min(means) if means else None
-
-
-def _branch_span(windows):
-    branches = [float(window.motion.thermal_branch.mean()) for window in windows if window.motion.thermal_branch is not None]
-    return max(branches) - min(branches) if branches else 0.0
 
 
 def _vibrates(windows):

@@ -48,12 +48,6 @@ def _unit_hum(time, rate):
     return np.sqrt(2.0) * np.sin(2 * np.pi * ALIASED * rate * time[:, None] + np.arange(3.0))
 
 
-def hum_of(variance: np.ndarray, period: float) -> np.ndarray:
-    """Return a vibration, m/s^2, of which `BandVariance` measures the variance of a recording, (m/s^2)^2, both shape (n, 3)."""
-    unit = _unit_hum(period * np.arange(len(variance)), 1.0 / period)
-    return unit * np.sqrt(variance / BandVariance().of(period, unit)[-1])
-
-
 SESSION_START_NS = 1_700_000_000_000_000_000
 """First stamp of simulated sessions: arbitrary but fixed, so that the same seed gives the same bytes."""
 SIMULATED_BLOCK_SAMPLES = 100_000
@@ -273,7 +267,9 @@ def replay(blocks: Iterable[SampleBlock], table: Table, model: SensorModel, *, v
     exact = {sensor: np.concatenate([output[sensor] for output in outputs]) for sensor in SENSORS}
     if model.uses('vibration'):   # biases follow the vibration of the readings
         known = [np.asarray(motion.vibration)[rows] for motion, _, rows in map(all_samples, chunks(windows))]
-        exact['accelerometer'] += hum_of(np.concatenate(known), period)
+        variance = np.concatenate(known)
+        unit = _unit_hum(period * np.arange(len(variance)), 1.0 / period)
+        exact['accelerometer'] += unit * np.sqrt(variance / BandVariance().of(period, unit)[-1])
     readings = []
     for sensor in SENSORS:
         own, shape = noise[sensor], exact[sensor].shape

@@ -65,15 +65,10 @@ def _best_motion(solution, question, mate, gravity):
     best = (MIN_EVIDENCE_GROWTH, None)
     for motion in MOTIONS:
         total = np.diag(1 / prior_sd**2) + added_information(model, values, solution.noise, motion=motion, gravity=gravity)
-        left = _unimitated(total, values, own)
+        left = float(values[own] @ np.linalg.solve(inverse_normal(total)[own, own], values[own]))
         if left > best[0]:
             best = (left, motion.text)
     return best[1]
-
-
-def _unimitated(information, values, own):
-    """Return the squared standard deviations of the effect's part that is not collinear with the model, its mate included."""
-    return float(values[own] @ np.linalg.solve(inverse_normal(information)[own, own], values[own]))
 
 
 LEAVES_MOST = 'rejected: most of the residual would remain'

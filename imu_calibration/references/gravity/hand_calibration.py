@@ -183,7 +183,9 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     sensors = SensorModel(options.accelerometer or BASE, options.gyroscope or default, temperature_ref_c=reference_c, point=point or {},
                           catalogue=options.catalogue)
     model = HandModel(sensors, options.gravity)
-    _check_temperature(model, poses)
+    thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
+    if thermal and poses.temperature_c is None:
+        raise InputError(f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or omit it')
     state = first_state(model, poses)
     model = replace(model, gyro_factor=full_scale_factor(state, poses, turns))
     turns, contradicted = possible_turns(model, state, poses, turns=turns)
@@ -231,12 +233,6 @@ def _settled(model, found):
             if abs(found.state.values[part][-1] / known - 1) > MAX_SETTLED_CHANGE:
                 return False
     return True
-
-
-def _check_temperature(model, poses):
-    thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
-    if thermal and poses.temperature_c is None:
-        raise InputError(f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or omit it')
 
 
 def default_gyroscope(poses: Poses) -> tuple[tuple[str, ...], dict]:

@@ -322,7 +322,9 @@ def merge(parts: Iterable[Gathered]) -> Gathered:
     for part in parts[1:]:
         total.accumulator.merge(part.accumulator)
         total.held_out.merge(part.held_out)
-        total.kept, total.poses = _within_reach(total.kept + part.kept), total.poses + part.poses
+        windows = total.kept + part.kept   # up to KEPT_SAMPLES samples
+        ends = np.cumsum([len(window.time) for window in windows])
+        total.kept, total.poses = windows[:int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))], total.poses + part.poses
         total.spreads = sorted(total.spreads + part.spreads, key=lambda spread: -spread.n_samples)[:MOST_ASKED]
         total.counts = {key: _added(total.counts.get(key, 0), part.counts.get(key, 0)) for key in {**total.counts, **part.counts}}
         total.largest_rate = max(total.largest_rate, part.largest_rate)
@@ -335,12 +337,6 @@ def merge(parts: Iterable[Gathered]) -> Gathered:
             total.first_stamp_ns = part.first_stamp_ns if total.first_stamp_ns is None else total.first_stamp_ns
             total.last_stamp_ns = (total.last_stamp_ns or total.first_stamp_ns) + part.last_stamp_ns - part.first_stamp_ns
     return total
-
-
-def _within_reach(windows):
-    """Return the windows up to KEPT_SAMPLES samples."""
-    ends = np.cumsum([len(window.time) for window in windows])
-    return windows[:int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))]
 
 
 def _added(a, b):
