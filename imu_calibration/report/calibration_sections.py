@@ -123,11 +123,12 @@ def observability_section(result: CalibrationResult) -> dict[str, Any]:
     """Return figures and weak directions."""
     calibration = result.calibration
     live = calibration.sd > 0
-    figures = {'bars': draw('bars', (8.6, 0.9 + ROW * live.sum()), _Bars(result, live),
+    figures = {'bars': draw('bars', (8.6, 0.9 + ROW * live.sum()), _bars, result, live,
                             label='Standard deviation over tolerance of every parameter'),
-               'correlation': draw('correlation', (7.2, 6.4), _Correlation(calibration, live), label='Correlation between the parameters')}
+               'correlation': draw('correlation', (7.2, 6.4), _heat_map, *_correlation(calibration, live),
+                                   label='Correlation between the parameters')}
     if len(result.singular_values):
-        figures['singular'] = draw('singular', (8.6, 2.5), _Singular(result.singular_values),
+        figures['singular'] = draw('singular', (8.6, 2.5), _stems, result.singular_values,
                                    label='Singular values of the design in units of the tolerances')
     return {**figures, 'directions': directions(calibration), 'strongest': strongest(calibration, live)}
 
@@ -158,78 +159,64 @@ def short_name(name: str) -> str:
     return rest if sensor == 'reference' else f'{PREFIXES[sensor]} {rest}'
 
 
-class _Bars:
+def _bars(figure, result, live):
     """One bar per parameter on a logarithmic axis, one at the tolerance."""
-
-    def __init__(self, result, live):
-        self.result, self.live = result, live
-
-    def __call__(self, figure):
-        calibration = self.result.calibration
-        share = (calibration.sd / self.result.tolerances)[self.live]
-        names = [n for n, flag in zip(calibration.param_names, self.live) if flag]
-        colours = [STATUS[s] for s, flag in zip(calibration.status, self.live) if flag]
-        axes = figure.subplots()
-        place = np.arange(len(names))[::-1]
-        low = min(1e-3, float(share.min()) / 2)
-        axes.barh(place, share - low, left=low, height=0.68, color=colours)
-        axes.axvline(1.0, color=INK, lw=1.0)
-        axes.annotate('tolerance', (1.0, len(names) - 0.2), ha='center', va='bottom', fontsize=8.5, color=INK, annotation_clip=False)
-        log_axis(axes.xaxis)
-        axes.set_xlim(low, max(10.0, 2 * float(share.max())))
-        axes.set_ylim(-0.8, len(names) - 0.2)
-        axes.set_yticks(place, [short_name(name) for name in names], fontsize=8)
-        axes.tick_params(axis='y', length=0)
-        axes.grid(axis='y', visible=False)
-        axes.set_xlabel('standard deviation / tolerance (left is better)')
+    calibration = result.calibration
+    share = (calibration.sd / result.tolerances)[live]
+    names = [n for n, flag in zip(calibration.param_names, live) if flag]
+    colours = [STATUS[s] for s, flag in zip(calibration.status, live) if flag]
+    axes = figure.subplots()
+    place = np.arange(len(names))[::-1]
+    low = min(1e-3, float(share.min()) / 2)
+    axes.barh(place, share - low, left=low, height=0.68, color=colours)
+    axes.axvline(1.0, color=INK, lw=1.0)
+    axes.annotate('tolerance', (1.0, len(names) - 0.2), ha='center', va='bottom', fontsize=8.5, color=INK, annotation_clip=False)
+    log_axis(axes.xaxis)
+    axes.set_xlim(low, max(10.0, 2 * float(share.max())))
+    axes.set_ylim(-0.8, len(names) - 0.2)
+    axes.set_yticks(place, [short_name(name) for name in names], fontsize=8)
+    axes.tick_params(axis='y', length=0)
+    axes.grid(axis='y', visible=False)
+    axes.set_xlabel('standard deviation / tolerance (left is better)')
 
 
-class _Singular:
+def _stems(figure, values):
     """Descending stems on a logarithmic axis."""
-
-    def __init__(self, values):
-        self.values = np.maximum(values, 1e-3)
-
-    def __call__(self, figure):
-        axes = figure.subplots()
-        place = np.arange(1, len(self.values) + 1)
-        colours = [AFTER if v >= 1 else STATUS['held'] for v in self.values]
-        axes.vlines(place, min(0.3, self.values.min() / 2), self.values, colors=colours, lw=2.2)
-        axes.scatter(place, self.values, s=14, c=colours, zorder=3)
-        axes.axhline(1.0, color=INK, lw=1.0)
-        log_axis(axes.yaxis)
-        axes.set_xlim(0, len(place) + 1)
-        axes.set_ylim(bottom=min(0.3, self.values.min() / 2))
-        axes.grid(axis='x', visible=False)
-        axes.set_xlabel('direction, best determined first')
-        axes.set_ylabel('tolerances per sd')
+    values = np.maximum(values, 1e-3)
+    axes = figure.subplots()
+    place = np.arange(1, len(values) + 1)
+    colours = [AFTER if v >= 1 else STATUS['held'] for v in values]
+    axes.vlines(place, min(0.3, values.min() / 2), values, colors=colours, lw=2.2)
+    axes.scatter(place, values, s=14, c=colours, zorder=3)
+    axes.axhline(1.0, color=INK, lw=1.0)
+    log_axis(axes.yaxis)
+    axes.set_xlim(0, len(place) + 1)
+    axes.set_ylim(bottom=min(0.3, values.min() / 2))
+    axes.grid(axis='x', visible=False)
+    axes.set_xlabel('direction, best determined first')
+    axes.set_ylabel('tolerances per sd')
 
 
-class _Correlation:
+def _heat_map(figure, matrix, names):
     """Heat map with lines between the effects."""
-
-    def __init__(self, calibration, live):
-        self.matrix, self.names = _correlation(calibration, live)
-
-    def __call__(self, figure):
-        axes = figure.subplots()
-        image = axes.imshow(self.matrix, cmap='RdBu_r', vmin=-1, vmax=1, interpolation='nearest')
-        groups = [short_name(name.rpartition('.')[0] + '.').strip() for name in self.names]
-        edges = [k for k in range(1, len(groups)) if groups[k] != groups[k - 1]]
-        for edge in edges:
-            axes.axhline(edge - 0.5, color=GREY, lw=0.6)
-            axes.axvline(edge - 0.5, color=GREY, lw=0.6)
-        bounds = [0, *edges, len(groups)]
-        middles = [(a + b - 1) / 2 for a, b in zip(bounds, bounds[1:])]
-        labels = [groups[a] for a in bounds[:-1]]
-        axes.set_xticks(middles, labels, rotation=40, ha='right', rotation_mode='anchor')
-        axes.set_yticks(middles, labels)
-        axes.tick_params(length=0)
-        axes.grid(visible=False)
-        for side in axes.spines.values():
-            side.set_visible(False)
-        bar = figure.colorbar(image, ax=axes, shrink=0.6, pad=0.02)
-        bar.outline.set_visible(False)
+    axes = figure.subplots()
+    image = axes.imshow(matrix, cmap='RdBu_r', vmin=-1, vmax=1, interpolation='nearest')
+    groups = [short_name(name.rpartition('.')[0] + '.').strip() for name in names]
+    edges = [k for k in range(1, len(groups)) if groups[k] != groups[k - 1]]
+    for edge in edges:
+        axes.axhline(edge - 0.5, color=GREY, lw=0.6)
+        axes.axvline(edge - 0.5, color=GREY, lw=0.6)
+    bounds = [0, *edges, len(groups)]
+    middles = [(a + b - 1) / 2 for a, b in zip(bounds, bounds[1:])]
+    labels = [groups[a] for a in bounds[:-1]]
+    axes.set_xticks(middles, labels, rotation=40, ha='right', rotation_mode='anchor')
+    axes.set_yticks(middles, labels)
+    axes.tick_params(length=0)
+    axes.grid(visible=False)
+    for side in axes.spines.values():
+        side.set_visible(False)
+    bar = figure.colorbar(image, ax=axes, shrink=0.6, pad=0.02)
+    bar.outline.set_visible(False)
 
 
 CAUSE_COLOURS = {'noise': '#1f66a8', 'levelling': '#c0561b', 'joint position': '#2b8a57', 'table rate': '#8a5aa8', 'gravity': '#b8860b'}
@@ -242,7 +229,7 @@ def budget_section(result: CalibrationResult) -> dict[str, Any]:
     budget = result.error_budget()
     terms = {name: np.sqrt(np.maximum(variance, 0.0)) for name, variance in result.calibration.covariance_terms.items()
              if np.any(variance > 0)}
-    return {'figure': draw('budget', (8.6, 0.9 + 0.26 * len(_effects(result))), _Dots(result, budget),
+    return {'figure': draw('budget', (8.6, 0.9 + 0.26 * len(_effects(result))), _dots, result, budget,
                            label='Error budget of each effect by cause, in tolerances'),
             'causes': list(budget.causes), 'texts': [(cause, budget.texts[cause]) for cause in budget.causes],
             'rows': _rows(result, list(budget.causes.values()), budget.total), 'terms': list(terms),
@@ -266,31 +253,26 @@ def _rows(result, causes, total):
     return rows
 
 
-class _Dots:
+def _dots(figure, result, budget):
     """One line per effect, one dot per cause, in tolerances."""
-
-    def __init__(self, result, budget):
-        self.result, self.budget = result, budget
-
-    def __call__(self, figure):
-        axes, effects = figure.subplots(), _effects(self.result)
-        place = np.arange(len(effects))[::-1]
-        highest = 1.0
-        for cause, values in self.budget.causes.items():
-            share = np.array([np.max(values[part] / self.result.tolerances[part]) for _, part in effects])
-            highest = max(highest, share.max())
-            shown = share > MIN_DRAWN_SHARE
-            axes.plot(share[shown], place[shown], 'o', color=CAUSE_COLOURS.get(cause, INK), label=cause, markersize=6, ls='none')
-        total = np.array([np.max(self.budget.total[part] / self.result.tolerances[part]) for _, part in effects])
-        axes.plot(total, place, '|', color=INK, markersize=13, mew=1.6, label='total', ls='none')
-        axes.axvline(1.0, color=INK, lw=1.0)
-        log_axis(axes.xaxis)
-        axes.set_xlim(MIN_DRAWN_SHARE, 3 * highest)
-        axes.set_ylim(-0.7, len(effects) - 0.3)
-        axes.set_yticks(place, [short_name(f'{e.sensor}.{e.name}') for e, _ in effects])
-        axes.tick_params(axis='y', length=0)
-        axes.set_xlabel('largest standard deviation / tolerance')
-        axes.legend(ncols=6, loc='lower center', bbox_to_anchor=(0.45, 1.0), columnspacing=1.2, handletextpad=0.1)
+    axes, effects = figure.subplots(), _effects(result)
+    place = np.arange(len(effects))[::-1]
+    highest = 1.0
+    for cause, values in budget.causes.items():
+        share = np.array([np.max(values[part] / result.tolerances[part]) for _, part in effects])
+        highest = max(highest, share.max())
+        shown = share > MIN_DRAWN_SHARE
+        axes.plot(share[shown], place[shown], 'o', color=CAUSE_COLOURS.get(cause, INK), label=cause, markersize=6, ls='none')
+    total = np.array([np.max(budget.total[part] / result.tolerances[part]) for _, part in effects])
+    axes.plot(total, place, '|', color=INK, markersize=13, mew=1.6, label='total', ls='none')
+    axes.axvline(1.0, color=INK, lw=1.0)
+    log_axis(axes.xaxis)
+    axes.set_xlim(MIN_DRAWN_SHARE, 3 * highest)
+    axes.set_ylim(-0.7, len(effects) - 0.3)
+    axes.set_yticks(place, [short_name(f'{e.sensor}.{e.name}') for e, _ in effects])
+    axes.tick_params(axis='y', length=0)
+    axes.set_xlabel('largest standard deviation / tolerance')
+    axes.legend(ncols=6, loc='lower center', bbox_to_anchor=(0.45, 1.0), columnspacing=1.2, handletextpad=0.1)
 
 
 LEVEL_FORCE_SHARE = 0.02

@@ -134,19 +134,19 @@ def _formula(diagnosis, rest):
     against = tuple(kind for effect in proposal.effects for kind in effect.against)
     return {'title': ' and '.join(proposal.columns), 'sentence': f'{_capital(in_type(proposal.relation))}.', 'rows': rows,
             'p': chance(proposal.p_value), **_gained(formula_gain(rest)),
-            'figure': draw(f'formula-{proposal.sensor}', (8.6, 3.1), _AgainstCause(diagnosis, proposal.sensor, against),
+            'figure': draw(f'formula-{proposal.sensor}', (8.6, 3.1), _against_cause, diagnosis, proposal.sensor, against,
                            label=f'Residual against the variable of the formula, before and after: {" and ".join(proposal.columns)}')}
 
 
 def draw_finding(diagnosis: Diagnosis, finding: Finding, number: int) -> Drawn:
     """Return the residual against the cause of a finding, before and after, as SVG."""
     label = f'Residual against the cause, before and after: {finding.effect}'
-    return draw(f'finding-{number}', (8.6, 3.1), _AgainstCause(diagnosis, finding.gain.sensor, finding.against), label=label)
+    return draw(f'finding-{number}', (8.6, 3.1), _against_cause, diagnosis, finding.gain.sensor, finding.against, label=label)
 
 
 def draw_over_time(result: DiagnosisResult) -> Drawn:
     """Return the size of the residuals over time, before and after the extension, as SVG."""
-    return draw('traces', (8.6, 4.2), _OverTime(result.diagnosis.traces, SPAN[result.observations]),
+    return draw('traces', (8.6, 4.2), _over_time, result.diagnosis.traces, SPAN[result.observations],
                 label='Residuals over time before and after the extension')
 
 
@@ -184,30 +184,25 @@ def cause_of(diagnosis: Diagnosis, sensor: str, against: Sequence[str]) -> tuple
     return axis, best[1], best[2]
 
 
-class _AgainstCause:
+def _against_cause(figure, diagnosis, sensor, against):
     """Two panels with one scale: before with the fitted curve, and after."""
-
-    def __init__(self, diagnosis, sensor, against):
-        self.diagnosis, self.sensor, self.against = diagnosis, sensor, against
-
-    def __call__(self, figure):
-        traces, sensor = self.diagnosis.traces, self.sensor
-        axis, label, values = cause_of(self.diagnosis, sensor, self.against)
-        factor, unit = for_people(UNITS[sensor])
-        before, after = (residual[sensor][:, axis] * factor for residual in (traces.before, traces.after))
-        left, right = figure.subplots(1, 2, sharey=True)
-        some = slice(None, None, max(1, len(values) // 2500))
-        for axes, residual, colour, title in ((left, before, BEFORE, 'before'), (right, after, AFTER, 'after')):
-            axes.plot(values[some], residual[some], '.', color=colour, markersize=_marker(values, 4), alpha=0.5, mew=0)
-            axes.axhline(0, color=GREY, lw=0.6)
-            axes.set_title(title)
-            axes.set_xlabel(label)
-        place, curve = _curve(values, before - after)
-        left.plot(place, curve, color=INK, lw=1.8, label='fitted effect')
-        left.legend(loc='best')
-        left.set_ylabel(f'{sensor} {"xyz"[axis]} residual, {unit}')
-        limit = 1.1 * float(np.quantile(np.abs(np.concatenate([before, after])), 0.998))
-        left.set_ylim(-limit, limit)
+    traces = diagnosis.traces
+    axis, label, values = cause_of(diagnosis, sensor, against)
+    factor, unit = for_people(UNITS[sensor])
+    before, after = (residual[sensor][:, axis] * factor for residual in (traces.before, traces.after))
+    left, right = figure.subplots(1, 2, sharey=True)
+    some = slice(None, None, max(1, len(values) // 2500))
+    for axes, residual, colour, title in ((left, before, BEFORE, 'before'), (right, after, AFTER, 'after')):
+        axes.plot(values[some], residual[some], '.', color=colour, markersize=_marker(values, 4), alpha=0.5, mew=0)
+        axes.axhline(0, color=GREY, lw=0.6)
+        axes.set_title(title)
+        axes.set_xlabel(label)
+    place, curve = _curve(values, before - after)
+    left.plot(place, curve, color=INK, lw=1.8, label='fitted effect')
+    left.legend(loc='best')
+    left.set_ylabel(f'{sensor} {"xyz"[axis]} residual, {unit}')
+    limit = 1.1 * float(np.quantile(np.abs(np.concatenate([before, after])), 0.998))
+    left.set_ylim(-limit, limit)
 
 
 def _marker(values, many):
@@ -226,23 +221,18 @@ def _curve(values, signal):
     return tuple(np.bincount(index, column, BINS)[filled] / count[filled] for column in (values, signal))
 
 
-class _OverTime:
+def _over_time(figure, traces, over):
     """Size of the residual over time, before and after, one panel per sensor."""
-
-    def __init__(self, traces, over):
-        self.traces, self.over = traces, over
-
-    def __call__(self, figure):
-        for axes, sensor in zip(figure.subplots(2, 1, sharex=True), SENSORS):
-            factor, unit = for_people(UNITS[sensor])
-            some = slice(None, None, max(1, len(self.traces.time) // 3000))
-            for residual, colour, label in ((self.traces.before, BEFORE, 'before'), (self.traces.after, AFTER, 'after')):
-                size = np.sqrt((residual[sensor]**2).sum(axis=1)) * factor
-                axes.plot(self.traces.time[some], size[some], '.', color=colour, markersize=_marker(size, 3), alpha=0.5, mew=0, label=label)
-            axes.set_title(f'{sensor}, size of the residual {self.over}, {unit}')
-            axes.set_ylim(bottom=0)
-        axes.set_xlabel('time, s')
-        figure.axes[0].legend(loc='upper right', markerscale=3)
+    for axes, sensor in zip(figure.subplots(2, 1, sharex=True), SENSORS):
+        factor, unit = for_people(UNITS[sensor])
+        some = slice(None, None, max(1, len(traces.time) // 3000))
+        for residual, colour, label in ((traces.before, BEFORE, 'before'), (traces.after, AFTER, 'after')):
+            size = np.sqrt((residual[sensor]**2).sum(axis=1)) * factor
+            axes.plot(traces.time[some], size[some], '.', color=colour, markersize=_marker(size, 3), alpha=0.5, mew=0, label=label)
+        axes.set_title(f'{sensor}, size of the residual {over}, {unit}')
+        axes.set_ylim(bottom=0)
+    axes.set_xlabel('time, s')
+    figure.axes[0].legend(loc='upper right', markerscale=3)
 
 
 def _candidate(row):

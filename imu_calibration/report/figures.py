@@ -99,7 +99,7 @@ STYLE: Any = {
 NAMESPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
 
 
-def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, label: str) -> Drawn:
+def draw(name: str, size: tuple[float, float], paint: Callable[..., None], *data: Any, label: str) -> Drawn:
     """
     Return a figure as SVG for the page, with the matplotlib figure.
 
@@ -110,7 +110,9 @@ def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, 
     size : (float, float)
         Inches; 96 pixels each on the page.
     paint : callable
-        ``paint(figure)`` draws on an empty matplotlib figure.
+        ``paint(figure, *data)`` draws on an empty matplotlib figure.
+    data
+        Its further arguments.
     label : str
         Text alternative of the figure.
 
@@ -122,7 +124,7 @@ def draw(name: str, size: tuple[float, float], paint: Callable[[Any], None], *, 
         matplotlib.rcdefaults()
         matplotlib.rcParams.update({**STYLE, 'svg.hashsalt': name})
         figure = Figure(figsize=size, layout='constrained')
-        paint(figure)
+        paint(figure, *data)
         canvas, text = _laid_out(figure), io.StringIO()
         figure.dpi = matplotlib.rcParams['figure.dpi']   # of pictures inside, which the canvas lays out at 72
         canvas.print_svg(text, metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None})
@@ -178,23 +180,18 @@ def draw_tones(sensor: str, rest: Unexplained) -> str:
     if not rest.tones:
         return ''
     label = f'Spectrum of the unexplained residual of the {sensor}'
-    return draw(f'tones-{sensor}', (8.6, 0.6 + 2.1 * len(rest.tones)), _Spectra(rest.tones), label=label)
+    return draw(f'tones-{sensor}', (8.6, 0.6 + 2.1 * len(rest.tones)), _spectra, rest.tones, label=label)
 
 
-class _Spectra:
+def _spectra(figure, tones):
     """One panel for each tone: the power of its axis over that around it."""
-
-    def __init__(self, tones):
-        self.tones = tones
-
-    def __call__(self, figure):
-        for axes, tone in zip(np.atleast_1d(figure.subplots(len(self.tones), 1)), self.tones):
-            axes.plot(tone.frequencies, tone.power, color=AFTER, lw=0.9)
-            axes.axhline(MIN_LINE_POWER, color=GREY, lw=0.6)
-            axes.axvline(tone.frequency, color=INK, lw=0.8, ls=':')
-            log_axis(axes.yaxis)
-            axes.set_ylabel(f'{tone.sensor} {tone.axis}: power / around')
-            axes.set_xlabel('frequency, Hz' if tone.joint is None else f'cycles per turn of {tone.joint}')
+    for axes, tone in zip(np.atleast_1d(figure.subplots(len(tones), 1)), tones):
+        axes.plot(tone.frequencies, tone.power, color=AFTER, lw=0.9)
+        axes.axhline(MIN_LINE_POWER, color=GREY, lw=0.6)
+        axes.axvline(tone.frequency, color=INK, lw=0.8, ls=':')
+        log_axis(axes.yaxis)
+        axes.set_ylabel(f'{tone.sensor} {tone.axis}: power / around')
+        axes.set_xlabel('frequency, Hz' if tone.joint is None else f'cycles per turn of {tone.joint}')
 
 
 PLANES = ((0, 1), (0, 2), (1, 2))
@@ -221,38 +218,32 @@ def lever_section(result: CalibrationResult) -> dict[str, Any] | None:
         return None
     gauge = result.calibration.gauge.get('origin')
     origin = 'the mean of the three sensitive points' if gauge == 'mean_of_sensitive_points' else 'the reference point of the mount'
-    return {'figure': draw('lever-arms', (8.6, 3.15), _Arms(result.calibration),
+    calibration, part = result.calibration, result.calibration.model.part('accelerometer', Role.ARMS)
+    return {'figure': draw('lever-arms', (8.6, 3.15), _views, arms_of(calibration) * 1e3, calibration.covariance[part, part] * 1e6,
                            label='Sensitive points of the three accelerometers in three views'), 'origin': origin}
 
 
-class _Arms:
+def _views(figure, arms, cov):
     """Three views: sensitive points with ellipses of two sd."""
+    limit = 1.25 * max(float(np.max(np.abs(arms))), 3 * float(np.sqrt(np.diag(cov).min())), 1e-3)
+    for axes, (across, up) in zip(figure.subplots(1, 3), PLANES):
+        axes.axhline(0, color=GREY, lw=0.6)
+        axes.axvline(0, color=GREY, lw=0.6)
+        for element, colour in enumerate(AXIS_COLOURS.values()):
+            index = [3 * element + across, 3 * element + up]
+            _point(axes, arms.ravel()[index], cov[np.ix_(index, index)], 'xyz'[element], colour)
+        axes.plot(0, 0, '+', color=INK, markersize=9, mew=1.3)
+        axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect='equal', xlabel=f'{"xyz"[across]}, mm', ylabel=f'{"xyz"[up]}, mm')
+        axes.locator_params(nbins=5)
 
-    def __init__(self, calibration):
-        self.arms = arms_of(calibration) * 1e3
-        part = calibration.model.part('accelerometer', Role.ARMS)
-        self.cov = calibration.covariance[part, part] * 1e6
 
-    def __call__(self, figure):
-        limit = 1.25 * max(float(np.max(np.abs(self.arms))), 3 * float(np.sqrt(np.diag(self.cov).min())), 1e-3)
-        for axes, (across, up) in zip(figure.subplots(1, 3), PLANES):
-            axes.axhline(0, color=GREY, lw=0.6)
-            axes.axvline(0, color=GREY, lw=0.6)
-            for element, colour in enumerate(AXIS_COLOURS.values()):
-                self._point(axes, element, across, up, colour)
-            axes.plot(0, 0, '+', color=INK, markersize=9, mew=1.3)
-            axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect='equal', xlabel=f'{"xyz"[across]}, mm', ylabel=f'{"xyz"[up]}, mm')
-            axes.locator_params(nbins=5)
-
-    def _point(self, axes, element, across, up, colour):
-        x, y = self.arms[element, across], self.arms[element, up]
-        axes.annotate('', (x, y), (0, 0), arrowprops={'arrowstyle': '-', 'color': colour, 'lw': 1.1, 'alpha': 0.55})
-        axes.plot(x, y, 'o', color=colour, markersize=5)
-        index = [3 * element + across, 3 * element + up]
-        values, vectors = np.linalg.eigh(self.cov[np.ix_(index, index)])
-        angle = np.linspace(0, 2 * np.pi, 61)
-        ring = 2 * np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
-        axes.plot(*(np.array([[x], [y]]) + vectors @ ring), color=colour, lw=0.9)
-        away = 11 * np.array([x, y]) / max(np.hypot(x, y), 1e-9)
-        axes.annotate('xyz'[element], (x, y), away, textcoords='offset points', color=colour, fontsize=10, fontweight='bold', ha='center',
-                      va='center')
+def _point(axes, place, cov, name, colour):
+    x, y = place
+    axes.annotate('', (x, y), (0, 0), arrowprops={'arrowstyle': '-', 'color': colour, 'lw': 1.1, 'alpha': 0.55})
+    axes.plot(x, y, 'o', color=colour, markersize=5)
+    values, vectors = np.linalg.eigh(cov)
+    angle = np.linspace(0, 2 * np.pi, 61)
+    ring = 2 * np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
+    axes.plot(*(np.array([[x], [y]]) + vectors @ ring), color=colour, lw=0.9)
+    away = 11 * np.array([x, y]) / max(np.hypot(x, y), 1e-9)
+    axes.annotate(name, (x, y), away, textcoords='offset points', color=colour, fontsize=10, fontweight='bold', ha='center', va='center')

@@ -55,7 +55,7 @@ def navigation_section(result: CalibrationResult, errors: WindowErrors) -> dict[
 
 def _shown(name, before, after, parts=None):
     (velocity_before, position_before), (velocity_after, position_after) = before.last(), after.last()
-    return {'figure': draw(f'growth-{name}', (8.6, 2.9), _Growths(before, after, parts or {}),
+    return {'figure': draw(f'growth-{name}', (8.6, 2.9), _growths, before, after, parts or {},
                            label='Growth of velocity and position errors, before and after calibration'),
             'seconds': text(before.time[-1]), 'runs': len(before.velocity), 'velocity': (text(velocity_before), text(velocity_after)),
             'position': (text(position_before), text(position_after))}
@@ -174,24 +174,19 @@ def _at_origin(calibration, ref):
     return Reference(ref.time, ref.mat_sn, force, ref.rate_s, ref.alpha_s, ref.gravity)
 
 
-class _Growths:
+def _growths(figure, before, after, parts):
     """Velocity and position, each with median and the range of the runs; parts of the expected error as thin lines."""
-
-    def __init__(self, before, after, parts):
-        self.pair, self.parts = (before, after), parts
-
-    def __call__(self, figure):
-        for axes, name, unit in zip(figure.subplots(1, 2), ('velocity', 'position'), ('m/s', 'm')):
-            for growth, colour, label in zip(self.pair, (BEFORE, AFTER), ('before', 'after')):
-                low, middle, high = np.quantile(np.maximum(getattr(growth, name)[:, 1:], 1e-12), (0.1, 0.5, 0.9), axis=0)
-                axes.fill_between(growth.time[1:], low, high, color=colour, alpha=0.16, lw=0)
-                axes.plot(growth.time[1:], middle, color=colour, label=label)
-            for (label, part), dash in zip(self.parts.items(), ('-', '--', ':')):
-                values = np.median(getattr(part, name)[:, 1:], axis=0)
-                if values[-1] > 0:
-                    axes.plot(part.time[1:], values, color=GREY, lw=1.0, ls=dash, label=label)
-            log_axis(axes.yaxis)
-            axes.set_title(f'{name} error, {unit}')
-            axes.set_xlabel('time, s')
-            axes.set_xlim(0, self.pair[0].time[-1])
-        figure.axes[0].legend(loc='lower right', fontsize=8)
+    for axes, name, unit in zip(figure.subplots(1, 2), ('velocity', 'position'), ('m/s', 'm')):
+        for growth, colour, label in zip((before, after), (BEFORE, AFTER), ('before', 'after')):
+            low, middle, high = np.quantile(np.maximum(getattr(growth, name)[:, 1:], 1e-12), (0.1, 0.5, 0.9), axis=0)
+            axes.fill_between(growth.time[1:], low, high, color=colour, alpha=0.16, lw=0)
+            axes.plot(growth.time[1:], middle, color=colour, label=label)
+        for (label, part), dash in zip(parts.items(), ('-', '--', ':')):
+            values = np.median(getattr(part, name)[:, 1:], axis=0)
+            if values[-1] > 0:
+                axes.plot(part.time[1:], values, color=GREY, lw=1.0, ls=dash, label=label)
+        log_axis(axes.yaxis)
+        axes.set_title(f'{name} error, {unit}')
+        axes.set_xlabel('time, s')
+        axes.set_xlim(0, before.time[-1])
+    figure.axes[0].legend(loc='lower right', fontsize=8)

@@ -30,7 +30,7 @@ def draw_steps(steps: Sequence[HandStep]) -> str:
     """Return the steps as SVG, numbered in the order of time."""
     shown = list(steps)[:MAX_ATTITUDES]
     rows = max(1, -(-len(shown) // FIGURE_COLUMNS))
-    return draw('hand-steps', (8.6, 1.75 * rows), lambda figure: _paint(figure, shown, rows), label='How to hold and to turn the IMU')
+    return draw('hand-steps', (8.6, 1.75 * rows), _paint, shown, rows, label='How to hold and to turn the IMU')
 
 
 def _paint(figure, steps, rows):
@@ -71,12 +71,12 @@ JOINT_COLOURS = tuple(AXIS_COLOURS.values()) + ('#8a4fa8', '#d08a12', '#555f6b',
 
 def draw_motion(plan: Plan) -> str:
     """Return the joints against time as SVG, the kinds of motion as a band above."""
-    return draw('plan-motion', (8.6, 3.6), lambda figure: _motion(figure, plan), label='Positions of the joints against time')
+    return draw('plan-motion', (8.6, 3.6), _motion, plan, label='Positions of the joints against time')
 
 
 def draw_progress(plan: Plan) -> Drawn:
     """Return the standard deviations in tolerances against time as SVG, one line for each parameter."""
-    return draw('plan-progress', (8.6, 4.2), lambda figure: _progress(figure, plan), label='Predicted standard deviations against time')
+    return draw('plan-progress', (8.6, 4.2), _progress, plan, label='Predicted standard deviations against time')
 
 
 def _motion(figure, plan):
@@ -104,24 +104,22 @@ def _motion(figure, plan):
 
 def draw_steps_progress(plan: HandPlan) -> str:
     """Return the same for the steps of a plan by hand."""
-    def paint(figure):
-        _fall(figure.subplots(), np.arange(len(plan.history)), plan.history, plan.param_names, label='poses and turns')
-    return draw('plan-progress', (8.6, 4.2), paint, label='Predicted standard deviations against steps')
+    return draw('plan-progress', (8.6, 4.2), _fall, np.arange(len(plan.history)), plan.history, plan.param_names, 'poses and turns',
+                label='Predicted standard deviations against steps')
 
 
 def _progress(figure, plan):
-    axes = figure.subplots()
     names = [name for name, wanted in zip(plan.model.param_names, plan.wanted, strict=True) if wanted]
-    _fall(axes, np.concatenate([[0.0], plan.ends]), plan.history, names, label='time, s')
+    axes = _fall(figure, np.concatenate([[0.0], plan.ends]), plan.history, names, 'time, s')
     if 0 < plan.lower_bound_seconds < np.inf and not plan.missing:
         axes.axvline(plan.lower_bound_seconds, color=FAINT, lw=1.2)
         axes.annotate('least time', (plan.lower_bound_seconds, axes.get_ylim()[1]), (4, -10), textcoords='offset points', color=GREY,
                       fontsize=8)
 
 
-def _fall(axes, time, history, names, *, label):
-    """Draw a line for each parameter, the worst of all, and the tolerance."""
-    shown = set()
+def _fall(figure, time, history, names, label):
+    """Draw a line for each parameter, the worst of all, and the tolerance; return the axes."""
+    axes, shown = figure.subplots(), set()
     for name, values in zip(names, history.T, strict=True):
         sensor = name.split('.')[0]
         colour = AXIS_COLOURS['x'] if sensor == SENSORS[0] else AXIS_COLOURS['z']
@@ -134,6 +132,7 @@ def _fall(axes, time, history, names, *, label):
     axes.set_xlabel(label)
     axes.set_ylabel('sd / tolerance')
     axes.legend(loc='upper right')
+    return axes
 
 
 SAYS = {MotionKind.POSE: 'rest', MotionKind.RETURN: 'return', MotionKind.SPIN: 'spin', MotionKind.SWING: 'swing',

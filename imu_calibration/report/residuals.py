@@ -20,7 +20,7 @@ KIND_TEXT = {'means': 'window means', 'static': 'at rest', 'spin': 'within spins
 def residual_section(result: CalibrationResult) -> dict[str, Any]:
     """Return figures and tables of the residuals."""
     traces = autocorrelation(result)
-    lags = draw('autocorrelation', (8.6, 2.7), _Lags(traces),
+    lags = draw('autocorrelation', (8.6, 2.7), _autocorrelations, traces,
                 label='Autocorrelation of the residuals within moving windows') if traces else None
     return {'autocorrelation': lags, 'noise': noise_rows(result.calibration), 'chi2': chi2_rows(result.calibration)}
 
@@ -28,36 +28,31 @@ def residual_section(result: CalibrationResult) -> dict[str, Any]:
 def draw_windows(errors: WindowErrors, sensor: str) -> Drawn:
     """Return the errors of raw and corrected readings of one sensor in every held-out window, as SVG."""
     label = f'Errors of raw and corrected readings of the {sensor} in every held-out window'
-    return draw(f'residuals-{sensor}', (7.2, 3.6), _Windows(errors, sensor), label=label)
+    return draw(f'residuals-{sensor}', (7.2, 3.6), _windows, errors, sensor, label=label)
 
 
-class _Windows:
+def _windows(figure, errors, sensor):
     """Two panels over time: raw, and corrected with the expected residual from noise."""
+    factor, unit = for_people(UNITS[sensor])
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1, 1.25])
+    _points(upper, errors.time, errors.before[sensor] * factor, hollow=True)
+    floor = 2 * errors.floor[sensor].max(axis=1) * factor
+    order = np.argsort(errors.time)
+    lower.fill_between(errors.time[order], -floor[order], floor[order], step='mid', color='#dfe5ec', lw=0, zorder=0.5)
+    _points(lower, errors.time, errors.after[sensor] * factor)
+    upper.set_title(f'{sensor}, raw')
+    lower.set_title('corrected; grey: two sd of the noise')
+    for axes in (upper, lower):
+        axes.axhline(0, color=GREY, lw=0.6)
+        axes.set_ylabel(unit)
+    lower.set_xlabel('time, s')
+    axis_legend(upper, 'lower right', bbox_to_anchor=(0.56, 1.0), borderaxespad=0.1)   # visible on a narrow screen without scrolling
 
-    def __init__(self, errors, sensor):
-        self.errors, self.sensor = errors, sensor
 
-    def __call__(self, figure):
-        errors, sensor = self.errors, self.sensor
-        factor, unit = for_people(UNITS[sensor])
-        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1, 1.25])
-        self._points(upper, errors.before[sensor] * factor, hollow=True)
-        floor = 2 * errors.floor[sensor].max(axis=1) * factor
-        order = np.argsort(errors.time)
-        lower.fill_between(errors.time[order], -floor[order], floor[order], step='mid', color='#dfe5ec', lw=0, zorder=0.5)
-        self._points(lower, errors.after[sensor] * factor)
-        upper.set_title(f'{sensor}, raw')
-        lower.set_title('corrected; grey: two sd of the noise')
-        for axes in (upper, lower):
-            axes.axhline(0, color=GREY, lw=0.6)
-            axes.set_ylabel(unit)
-        lower.set_xlabel('time, s')
-        axis_legend(upper, 'lower right', bbox_to_anchor=(0.56, 1.0), borderaxespad=0.1)   # visible on a narrow screen without scrolling
-
-    def _points(self, axes, values, hollow=False):
-        for (name, colour), column in zip(AXIS_COLOURS.items(), values.T):
-            axes.plot(self.errors.time, column, MARKER[name], color=colour, markersize=3.8, mfc='none' if hollow else colour, mew=0.8,
-                      alpha=0.9, label=name)
+def _points(axes, time, values, hollow=False):
+    for (name, colour), column in zip(AXIS_COLOURS.items(), values.T):
+        axes.plot(time, column, MARKER[name], color=colour, markersize=3.8, mfc='none' if hollow else colour, mew=0.8,
+                  alpha=0.9, label=name)
 
 
 def autocorrelation(result: CalibrationResult) -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
@@ -88,24 +83,19 @@ def _lagged(rest, n_lags):
     return np.fft.irfft(np.abs(spectrum)**2, size, axis=0)[:n_lags]
 
 
-class _Lags:
+def _autocorrelations(figure, traces):
     """One panel per sensor."""
-
-    def __init__(self, traces):
-        self.traces = traces
-
-    def __call__(self, figure):
-        panels = figure.subplots(1, len(self.traces), sharey=True, squeeze=False)[0]
-        for axes, (sensor, (lags, values, bound)) in zip(panels, self.traces.items()):
-            axes.axhspan(-bound, bound, color='#dfe5ec', lw=0, zorder=0.5)
-            for (name, colour), column in zip(AXIS_COLOURS.items(), values[1:].T):
-                axes.plot(lags[1:], column, color=colour, lw=1.0, marker=MARKER[name], markersize=3, markevery=max(1, len(column) // 12))
-            limit = max(0.15, 1.1 * float(np.max(np.abs(values[1:]))))
-            axes.set_ylim(-limit, limit)
-            axes.set_title(sensor)
-            axes.set_xlabel('lag, s')
-        panels[0].set_ylabel('autocorrelation')
-        axis_legend(panels[-1])
+    panels = figure.subplots(1, len(traces), sharey=True, squeeze=False)[0]
+    for axes, (sensor, (lags, values, bound)) in zip(panels, traces.items()):
+        axes.axhspan(-bound, bound, color='#dfe5ec', lw=0, zorder=0.5)
+        for (name, colour), column in zip(AXIS_COLOURS.items(), values[1:].T):
+            axes.plot(lags[1:], column, color=colour, lw=1.0, marker=MARKER[name], markersize=3, markevery=max(1, len(column) // 12))
+        limit = max(0.15, 1.1 * float(np.max(np.abs(values[1:]))))
+        axes.set_ylim(-limit, limit)
+        axes.set_title(sensor)
+        axes.set_xlabel('lag, s')
+    panels[0].set_ylabel('autocorrelation')
+    axis_legend(panels[-1])
 
 
 def noise_rows(calibration: Calibration) -> list[dict[str, Any]]:
