@@ -37,7 +37,7 @@ PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 LANES = $(PY) test/run_lanes.py
 PROCESSES = $(PLUGINS) -n 3
 
-.PHONY: help setup demo live-demo test test-long test-all test-fast mutants lint lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
+.PHONY: help setup demo live-demo test test-long test-all test-fast mutants lint lint-tools lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
@@ -85,6 +85,8 @@ oracles: $(STAMP)
 
 # Unused names and arguments, line length, docstrings, annotations, size of the product, marker words: less than a minute, half with -j2.
 lint: lint-code lint-types lint-size lint-words
+
+lint-tools: $(STAMP)-lint
 
 lint-code: $(STAMP)-lint
 	$(VENV)/bin/ruff check .

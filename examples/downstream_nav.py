@@ -31,7 +31,7 @@ from msg_adapters.imu_stream import ImuStream  # noqa: E402
 from msg_adapters.write import write_session  # noqa: E402
 
 SESSION = ROOT / 'bags' / 'sample_session'
-GRAVITY, RATE, SECONDS, LEG, STOP = 9.81, 100.0, 120.0, 20.0, 4.0
+GRAVITY, RATE, LEG, STOP = 9.81, 100.0, 20.0, 4.0
 FACTOR = 5.0
 """Simulated seconds per second."""
 DEPTH = 20_000
@@ -43,9 +43,9 @@ TOPICS = {'imu/data_raw': 'odom_raw', 'imu/data': 'odom'}
 PATIENCE = 120.0
 
 
-def drive(seed):
+def drive(seed, seconds):
     """Return (time, true rate, true force, path) of a robot that drives curves on a floor and stops before each leg."""
-    rng, time_ = np.random.default_rng(seed), np.arange(0, SECONDS, 1 / RATE)
+    rng, time_ = np.random.default_rng(seed), np.arange(0, seconds, 1 / RATE)
     phase, leg = time_ % LEG, (time_ // LEG).astype(int)
     moving = np.clip(np.minimum(phase - STOP, LEG - phase), 0, 1)   # each leg begins at rest
     speed = moving * rng.uniform(0.5, 1.2, leg[-1] + 1)[leg]
@@ -176,14 +176,14 @@ def draw(found, path, picture):
     axes.plot(*(path - path[0]).T, color='0.3', linewidth=3, label='true')
     for (topic, (_, last, positions)), color in zip(found.items(), ('tab:red', 'tab:blue'), strict=True):
         axes.plot(*positions.T, color=color, label=f'/{topic}: error {last:.1f} m at the end')
-    axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal', title=f'Dead reckoning for {SECONDS:.0f} s, at rest every {LEG:.0f} s')
+    axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal', title=f'Dead reckoning for {len(path) / RATE:.0f} s, at rest every {LEG:.0f} s')
     axes.legend(loc='lower left', fontsize=8)
     figure.savefig(picture, dpi=90)
 
 
-def run(domain_id, picture, folder):
+def run(domain_id, picture, seconds, folder):
     """Simulate, calibrate, play, navigate, compare."""
-    time_, rate, force, path = drive(3)
+    time_, rate, force, path = drive(3, seconds)
     imu = measured(time_, rate, force, 4)
     write_session(folder / 'drive', imu)
     calibrate([str(SESSION)], str(SESSION / 'table.yaml')).save(folder, report=False)
@@ -195,7 +195,7 @@ def run(domain_id, picture, folder):
     for topic, (most, last, _) in found.items():
         print(f'/{topic}: error {last:.2f} m at the end, largest {most:.2f} m')
     (_, raw, _), (_, corrected, _) = found.values()
-    print(f'the calibration reduces the position error after {SECONDS:.0f} s by {raw - corrected:.2f} m')
+    print(f'the calibration reduces the position error after {seconds:.0f} s by {raw - corrected:.2f} m')
     if picture:
         draw(found, path, picture)
         print(f'written: {picture}')
@@ -206,6 +206,7 @@ if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--domain-id', type=int, default=1 + os.getpid() % 100, help='ROS_DOMAIN_ID, default one of its own')
     parser.add_argument('--picture', metavar='FILE', default=str(ROOT / 'docs' / 'downstream_nav.png'), help='file of the figure')
+    parser.add_argument('--seconds', type=float, default=120.0, help='length of the drive, default 120')
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        sys.exit(run(options.domain_id, options.picture, Path(temporary)))
+        sys.exit(run(options.domain_id, options.picture, options.seconds, Path(temporary)))

@@ -66,8 +66,8 @@ def require_place(options: Namespace, verb: str, bags: Sequence[str]) -> None:
         require_same_inputs(options.output, provenance_with(verb, bags, choices_of(options), stand=stand_of(options)))
 
 
-def add_model_arguments(parser: OneLineParser) -> _ArgumentGroup:
-    """Add the options that choose the parameters to estimate; return their group."""
+def add_model_arguments(parser: OneLineParser, *, searched: bool = True) -> None:
+    """Add the options that choose the parameters to estimate; `searched`: and the option that omits the search for effects."""
     group = parser.expert
     expert = group.add_argument
     expert('--accelerometer-model', metavar='MODEL', help='effects joined by +; default bias+matrix, and '
@@ -80,7 +80,8 @@ def add_model_arguments(parser: OneLineParser) -> _ArgumentGroup:
     expert('--noise', metavar='FILE', help='noise.yaml of this IMU: model of its biases (table only)')
     expert('--setting', metavar='NAME=VALUE', action='append', default=[],
            help='of the window detection; an unknown name lists all')
-    return group
+    if searched:
+        expert('--model-as-asked', action='store_true', help='add no effect to the requested model')
 
 
 def add_effects_argument(group: _ArgumentGroup) -> None:

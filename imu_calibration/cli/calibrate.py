@@ -20,8 +20,7 @@ def add_arguments(parser: OneLineParser) -> None:
     arguments.add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
     arguments.add_topic_arguments(parser)
     arguments.add_result_arguments(parser)
-    arguments.add_model_arguments(parser).add_argument('--model-as-asked', action='store_true',
-                                             help='add no effect to the requested model')
+    arguments.add_model_arguments(parser)
 
 
 def run(options: Namespace) -> VerbResult:

@@ -18,7 +18,7 @@ def add_arguments(parser: OneLineParser) -> None:
     arguments.add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
     arguments.add_topic_arguments(parser)
     arguments.add_result_arguments(parser)
-    arguments.add_model_arguments(parser)
+    arguments.add_model_arguments(parser, searched=False)
 
 
 def run(options: Namespace) -> VerbResult:

@@ -16,7 +16,7 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_argument('bag', metavar='BAG', help=BAG)
     add_stand_arguments(parser, 'with it, axes and units are compared with the joints and the motions are listed')
     add_topic_arguments(parser)
-    add_model_arguments(parser)
+    add_model_arguments(parser, searched=False)
 
 
 def run(options: Namespace) -> VerbResult:

@@ -17,8 +17,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
     add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
     add_topic_arguments(parser)
-    add_model_arguments(parser).add_argument('--model-as-asked', action='store_true',
-                                             help='add no effect to the requested model')
+    add_model_arguments(parser)
 
 
 def run(options: Namespace) -> VerbResult:

@@ -5,6 +5,7 @@ import pickle
 import re
 import subprocess
 import sys
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 
@@ -26,31 +27,30 @@ ROOT = Path(__file__).resolve().parents[2]
 EDGES = ('cli', 'nodes')
 
 
+@lru_cache(maxsize=1)
 def core():
-    """Syntax tree of each module that is no edge."""
-    for folder in ('imu_calibration', 'msg_adapters'):
-        for path in sorted((ROOT / folder).rglob('*.py')):
-            if not (folder == 'imu_calibration' and path.relative_to(ROOT).parts[1] in EDGES):
-                yield path, ast.parse(path.read_text())
+    """Path of each module that is no edge -> (its texts, the keys of its errors)."""
+    paths = [path for folder in ('imu_calibration', 'msg_adapters') for path in sorted((ROOT / folder).rglob('*.py'))
+             if not (folder == 'imu_calibration' and path.relative_to(ROOT).parts[1] in EDGES)]
+    return {path: texts_and_keys(ast.parse(path.read_text())) for path in paths}
+
+
+def texts_and_keys(tree):
+    """Return the texts of a module, and the keys of its errors."""
+    nodes = list(ast.walk(tree))
+    return ([node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)],
+            {part.value for node in nodes if isinstance(node, ast.keyword) and node.arg == 'key'
+             for part in ast.walk(node.value) if isinstance(part, ast.Constant) and part.value in ERROR_KEYS})
 
 
 def test_no_text_of_the_core_names_an_option_of_the_command_line():
-    found = [(path.name, node.value) for path, tree in core() for node in ast.walk(tree)
-             if isinstance(node, ast.Constant) and isinstance(node.value, str) and re.search(r'(?<![\w-])--[a-z][a-z-]+', node.value)]
-    assert found == []
-
-
-def keys_in(trees):
-    """Return the keys of errors in modules."""
-    return {part.value for tree in trees for node in ast.walk(tree) if isinstance(node, ast.keyword) and node.arg == 'key'
-            for part in ast.walk(node.value) if isinstance(part, ast.Constant) and part.value in ERROR_KEYS}
+    assert [(path.name, text) for path, (texts, _) in core().items() for text in texts if re.search(r'(?<![\w-])--[a-z][a-z-]+', text)] == []
 
 
 def test_no_text_of_the_core_tells_to_run_a_verb():
     """The user of a node has no recording; `errors.REMEDY_VERBS` are replaced there."""
-    found = {(path.stem, verb) for path, tree in core() for node in ast.walk(tree) if path.stem not in ('errors', 'page')
-             if isinstance(node, ast.Constant) and isinstance(node.value, str)
-             for verb in re.findall(r"(?<!written by )'imu_calibration (\w+)'", node.value)}
+    found = {(path.stem, verb) for path, (texts, _) in core().items() for text in texts if path.stem not in ('errors', 'page')
+             for verb in re.findall(r"(?<!written by )'imu_calibration (\w+)'", text)}
     # To apply a calibration to a recording, beside compensator_node; in a document that `import` writes.
     assert found == {('verdict', 'compensate'), ('loss', 'check')}
 
@@ -78,11 +78,12 @@ def test_every_key_that_can_reach_a_node_has_a_name_there(node):
     pytest.importorskip('rclpy')
     program = f'import sys, imu_calibration.nodes.{node}; print(*[m.__file__ for m in sys.modules.values() if getattr(m, "__file__", None)])'
     files = set(subprocess.run([sys.executable, '-c', program], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split())
-    assert keys_in(tree for path, tree in core() if str(path) in files) - set(HINTS.get(node, {})) == set(UNREACHABLE.get(node, {}))
+    reached = set().union(*(keys for path, (_, keys) in core().items() if str(path) in files))
+    assert reached - set(HINTS.get(node, {})) == set(UNREACHABLE.get(node, {}))
 
 
 def test_every_key_is_known_and_every_known_one_is_used():
-    used = keys_in(tree for _, tree in core())
+    used = set().union(*(keys for _, keys in core().values()))
     from msg_adapters.bag import TOPIC_KEYS as topics
     assert used | set(topics.values()) == set(ERROR_KEYS)
 

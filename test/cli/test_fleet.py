@@ -47,7 +47,7 @@ def recordings(tmp_path_factory):
 
 def run_fleet(folder, output, *more):
     """Run the verb without reports."""
-    return main(['fleet', str(folder), '--table', str(TABLE_FILE), '--output', str(output), '--no-report', *more])
+    return main(['fleet', str(folder), '--table', str(TABLE_FILE), '--output', str(output), '--no-report', '--model-as-asked', *more])
 
 
 def read_csv(path):

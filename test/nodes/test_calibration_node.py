@@ -27,7 +27,8 @@ from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from ros.live_station import Station, taken  # noqa: E402
 
 pytestmark = pytest.mark.live
-RATE = 10.0
+RATE = 20.0
+SAMPLE_RATE = 50.0
 
 
 @pytest.fixture(scope='module')
@@ -35,7 +36,7 @@ def bags(tmp_path_factory):
     """Two sessions of one IMU: one to calibrate with, also in two parts, and one of another motion to correct, an hour later."""
     folder = tmp_path_factory.mktemp('bags')
     for name, profile in (('session', 'quick'), ('drive', 'tumbling')):
-        imu, joints, values, model = make_session(3, profile=profile)
+        imu, joints, values, model = make_session(3, SAMPLE_RATE, profile=profile)
         write_session(folder / name, imu, joints)
         if name == 'session':
             cut = imu.stamp_ns[len(imu) * 4 // 5]
@@ -106,8 +107,8 @@ def check_the_stream(corrected, bag):
         assert np.sqrt((after**2).mean()) < 0.1 * np.sqrt((before**2).mean())
 
 
-def means(error, length=100):
-    """Means over one second at 100 Hz."""
+def means(error, length=int(SAMPLE_RATE)):
+    """Means over one second."""
     return error[:len(error) // length * length].reshape(-1, length, 3).mean(axis=1)
 
 
@@ -120,7 +121,7 @@ def values_of(station, name):
 @pytest.mark.long
 def test_a_hidden_effect_is_named_live(tmp_path):
     """Quadratic terms that the model lacks: diagnostics say so, as the verb does of the same bag, and the calibration is the verb's."""
-    session = physics.make_session(3, {'accel_quadratic': None})
+    session = physics.make_session(3, {'accel_quadratic': None}, profile='quick')
     physics.write_bag(session, tmp_path / 'bag')
     (tmp_path / 'table.yaml').write_text(yaml.safe_dump(session.table))
     table = Table.from_mapping(session.table)

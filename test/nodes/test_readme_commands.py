@@ -33,11 +33,11 @@ PAGES = ('docs/ros.md', 'README.md')
 
 
 def commands():
-    """Every command of the fenced blocks that calls ros2, its lines joined, without comments."""
+    """Each command of the fenced blocks that calls ros2, once, its lines joined, without comments."""
     pages = '\n'.join((ROOT / name).read_text() for name in PAGES)
     blocks = re.findall(r'^```\w*\n(.*?)^```', pages, re.DOTALL | re.MULTILINE)
     lines = '\n'.join(blocks).replace('\\\n', ' ').splitlines()
-    return [re.sub(r'\s+', ' ', line.split('  #')[0]).strip() for line in lines if 'ros2 ' in line]
+    return list(dict.fromkeys(re.sub(r'\s+', ' ', line.split('  #')[0]).strip() for line in lines if 'ros2 ' in line))
 
 
 def starts(command):

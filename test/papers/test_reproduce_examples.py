@@ -58,7 +58,8 @@ def test_a_navigation_node_is_better_off_with_corrected_readings(tmp_path):
     pytest.importorskip('rclpy')
     environment = dict(os.environ, PYTHONPATH=str(ROOT))
     domain_id, lock = free_domain()
-    command = [sys.executable, str(ROOT / 'examples/downstream_nav.py'), '--picture', str(tmp_path / 'paths.png'), '--domain-id', str(domain_id)]
+    command = [sys.executable, str(ROOT / 'examples/downstream_nav.py'), '--picture', str(tmp_path / 'paths.png'), '--domain-id', str(domain_id),
+               '--seconds', '60']
     for _ in range(2):   # a machine that is too busy for it says so
         done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=240)
         if 'lost' not in done.stderr:
@@ -66,5 +67,5 @@ def test_a_navigation_node_is_better_off_with_corrected_readings(tmp_path):
     lock.close()
     assert done.returncode == 0, done.stdout + done.stderr
     raw, corrected = (float(re.search(rf'/{topic}: \D*([\d.]+) m ', done.stdout)[1]) for topic in ('imu/data_raw', 'imu/data'))
-    assert corrected < 0.2 * raw and f'{raw - corrected:.2f} m' in done.stdout
+    assert corrected < 0.5 * raw and f'{raw - corrected:.2f} m' in done.stdout
     assert (tmp_path / 'paths.png').stat().st_size > 1000 and 'Traceback' not in done.stderr
