@@ -128,7 +128,7 @@ def wobble_at(wobble: tuple[tuple[int, complex], ...], angle: np.ndarray, rate: 
     return found
 
 
-_CHAIN_BLOCK_SAMPLES = 8192  # samples whose intermediates fit in the processor's cache
+_CHAIN_BLOCK_SAMPLES = 1024  # samples whose intermediates fit in the processor's cache
 
 
 class _Link(NamedTuple):

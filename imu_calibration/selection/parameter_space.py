@@ -154,7 +154,8 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
                              *(np.full(len(entry.param_names), entry.effect.smooth) for entry in bank)])
     index, join, join_within = {}, {}, {}
     for sensor in SENSORS:
-        parts = [_join(model, sensor, axis, recording, removed, smooth) for axis in range(3)]
+        jacobian = coefficient_jacobian(model, sensor, recording.values)
+        parts = [_join(jacobian[:, axis], sensor, axis, recording, removed, smooth) for axis in range(3)]
         index[sensor], join[sensor], join_within[sensor] = map(list, zip(*parts))
     sd = np.concatenate([sd, *(entry.prior_sd for entry in bank)])
     return ParameterSpace(recording, tuple(names), sd, np.pad(shift, (0, len(names) - len(shift))), index, join, join_within)
@@ -167,10 +168,9 @@ def bank_places(recording: ReducedRecording) -> dict[str, slice]:
     return {entry.label: slice(a, b) for entry, a, b in zip(entries, ends, ends[1:])}
 
 
-def _join(model, sensor, axis, recording, removed, smooth):
+def _join(jacobian, sensor, axis, recording, removed, smooth):
     """Return (parameters that act on an axis, matrix that joins columns to them, the matrix for the part within windows)."""
     bank, places = recording.bank[sensor], bank_places(recording)
-    jacobian = coefficient_jacobian(model, sensor, recording.values)[:, axis]
     p, n_model = jacobian.shape
     ends = np.cumsum([p, *(len(entry.slopes) for entry in bank)])
     full = np.zeros((ends[-1] + 3, len(smooth) + 1))
