@@ -108,7 +108,7 @@ def print_budget():
         print(f'{cause:14s}' + ''.join(f'   {name} {1e3 * np.max(row):.4f}' for name, row in zip(avrutov.MODEL_COLUMNS['linear'], sd)))
     tilted = avrutov.design_matrix(avrutov.gravity_readings(mat_bn, 'z', (TILT, 0))) @ truth
     solution = avrutov_budget.calibrate_with_tilt(mat_bn, tilted, 'z')
-    print(f'levelling estimated with the three sensors jointly: rank {solution.linear.rank} of 14, '
+    print(f'levelling estimated with the three sensors jointly: rank {len(solution.linear.param_names)} of 14, '
           f'largest error {np.max(np.abs(solution.coefficients - truth)):.1e} V/g, tilt {60 * np.rad2deg(solution.tilt_rad[0]):.6f} arcmin')
 
 

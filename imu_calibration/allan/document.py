@@ -135,10 +135,10 @@ def _axis(section, k, deviation):
                    for name, entry in (section.get('taken_out') or {}).items() if entry['value'][k] is not None)
     record_for = {name: values[k] for name, values in (section.get('record_for') or {}).items() if terms[name].status != TERM_DETERMINED}
     others = tuple(tuple(form) for form in section['also_possible'][k])
-    return AxisFigures(terms, tuple(section['slow_part'][k]), others, alternatives, trends, record_for, float(section['sample_sd'][k]),
-                       float(section['shortest_averaging_time'][k]), float(section['excess'][k]),
-                       _pair((section.get('oscillation') or [None] * 3)[k]),
-                       float((section.get('scatter_between_rests') or [0.0] * 3)[k]), tuple(float(v) for v in deviation))
+    return AxisFigures(terms, tuple(section['slow_part'][k]), others, alternatives, float(section['shortest_averaging_time'][k]),
+                       float(section['excess'][k]), _pair((section.get('oscillation') or [None] * 3)[k]),
+                       float((section.get('scatter_between_rests') or [0.0] * 3)[k]), trends=trends, record_for=record_for,
+                       sample_sd=float(section['sample_sd'][k]), deviation=tuple(float(v) for v in deviation))
 
 
 def _pair(values):

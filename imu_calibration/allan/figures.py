@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, NoiseProcess, allan_variance, gauss_markov
-from imu_calibration.allan.terms import TIME_KEY, Term
+from imu_calibration.allan.terms import TIME_KEY, AxisNoise
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import BiasProcess
 
@@ -29,31 +29,15 @@ class TrendFigure:
 
 
 @dataclass(frozen=True, eq=False)
-class AxisFigures:
-    """The noise of one axis."""
+class AxisFigures(AxisNoise):
+    """The noise of one axis of a recording."""
 
-    terms: dict[str, Term]
-    """Name of the process -> its figure."""
-    form: tuple[str, ...] = ()
-    """Processes that make the slow part."""
-    others: tuple[tuple[str, ...], ...] = ()
-    """Forms that explain the curve as well."""
-    alternatives: dict[str, Term] = field(default_factory=dict)
-    """Figures of processes that occur only in these forms."""
     trends: tuple[TrendFigure, ...] = ()
     """Subtracted trends."""
     record_for: dict[str, float | None] = field(default_factory=dict)
     """Name of a figure that is not determined -> seconds of rest that would do, None: more than two days of it."""
     sample_sd: float = 0.0
     """Standard deviation of single samples as measured."""
-    shortest: float = 0.0
-    """Shortest averaging time that was fitted, s; longer than the period where the sensor filters its noise."""
-    excess: float = 1.0
-    """Factor on all variances of the fit because the misfit exceeds the sampling error."""
-    oscillation: tuple[float, float] | None = None
-    """Frequency (Hz) and amplitude of a line of the periodogram at the hump of a curve that no model explains."""
-    scatter: float = 0.0
-    """Standard deviation of the level of the variances from rest to rest, over the level."""
     deviation: tuple[float, ...] = ()
     """Allan deviations at the averaging times of the document."""
 

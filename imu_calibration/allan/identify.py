@@ -258,9 +258,8 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
 
 def _axis_figures(record, k, axis, times):
     trends = tuple(TrendFigure(trend.name, trend.coefficient, trend.sd, trend.time) for trend in record.trends[k])
-    return AxisFigures(axis.terms, axis.form, axis.others, axis.alternatives, trends, _record_for(axis, times), float(record.sample_sd[k]),
-                       axis.shortest, axis.excess, axis.oscillation, axis.scatter,
-                       tuple(float(v) for v in np.sqrt(record.curve.variance[:, k])))
+    return AxisFigures(**vars(axis), trends=trends, record_for=_record_for(axis, times), sample_sd=float(record.sample_sd[k]),
+                       deviation=tuple(float(v) for v in np.sqrt(record.curve.variance[:, k])))
 
 
 def _record_for(axis, times):

@@ -268,9 +268,9 @@ def coefficient_interval(moments: Moments, fits: Sequence[MomentFit], weights: S
     return lower, _crossing(lambda value: tails(value)[1] - TAIL, middle, step)
 
 
-def score_at_zero(moments: Moments, fit: MomentFit, index: int) -> float:
-    """Return the p-value of process `index`: the null hypothesis is a coefficient of zero."""
-    return _ScoreOfCoefficient(moments, fit, 1.0, index).tails(0.0)[0]
+def score_at_zero(moments: Moments, fit: MomentFit) -> float:
+    """Return the p-value of the first process: the null hypothesis is a coefficient of zero."""
+    return _ScoreOfCoefficient(moments, fit, 1.0, 0).tails(0.0)[0]
 
 
 def time_interval(moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], *, excess: float = 1.0) -> tuple[float, float]:

@@ -19,12 +19,8 @@ class NoiseProcess:
 
     name: str
     """Name in noise.yaml."""
-    unit: str
-    """Factor after the sensor's unit."""
     kernel: Callable[[np.ndarray], np.ndarray]
     """Generalised covariance of the integral at lags in s; even, known up to even polynomials of degree two."""
-    explanation: str
-    """One sentence."""
     lattice: bool = False
     """Whether the kernel lives on the sampling instants only (a spike at zero)."""
     time: float = 0.0
@@ -64,11 +60,11 @@ def _random_walk(lag):
     return np.abs(lag)**3 / 12
 
 
-QUANTISATION = NoiseProcess('quantisation', 's', _quantisation, 'The output has discrete steps: variance 3 Q^2 / tau^2.', lattice=True)
-WHITE = NoiseProcess('white_noise', '/sqrt(Hz)', _white, 'Every sample errs by itself: variance N^2 / tau.')
-FLICKER = NoiseProcess('bias_instability', '', _flicker,
-                       'The bias has noise of density B^2 / (2 pi f): variance (2 ln 2 / pi) B^2 at every tau.')
-RANDOM_WALK = NoiseProcess('random_walk', '/s/sqrt(Hz)', _random_walk, 'The bias walks at random: variance K^2 tau / 3.')
+QUANTISATION = NoiseProcess('quantisation', _quantisation, lattice=True)
+WHITE = NoiseProcess('white_noise', _white)
+FLICKER = NoiseProcess('bias_instability', _flicker)
+RANDOM_WALK = NoiseProcess('random_walk', _random_walk)
+"""Allan variances: 3 Q^2 / tau^2, N^2 / tau, (2 ln 2 / pi) B^2 at every tau, K^2 tau / 3."""
 
 
 @lru_cache(maxsize=512)
@@ -80,7 +76,7 @@ def gauss_markov(time: float) -> NoiseProcess:
         small = u < SMALL
         values[small] = -u[small]**3 * np.polyval(SERIES, -u[small])
         return -time**2 * values
-    return NoiseProcess('gauss_markov', '', kernel, f'The bias wanders and forgets within {time:g} s.', time=time)
+    return NoiseProcess('gauss_markov', kernel, time=time)
 
 
 FLATNESS = (2 * np.log(2) / np.pi)**0.5

@@ -1,6 +1,7 @@
 """Noise terms of one axis, and the forms of models that are compared."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc, digamma, polygamma
@@ -99,7 +100,7 @@ def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
     """Fit every form, with quantisation where the curve shows it; `excess`: factor on all covariances of an unexplained curve."""
     fits = _all_forms(moments, (), excess)
     wider = fit_form(moments, fits[0].form, (QUANTISATION.name,))
-    if score_at_zero(moments, wider.fit, 0) < QUANTISATION_P_VALUE:
+    if score_at_zero(moments, wider.fit) < QUANTISATION_P_VALUE:
         fits = _all_forms(moments, (QUANTISATION.name,), excess)
     return Choice(fits, moments)
 
@@ -204,24 +205,24 @@ class Term:
 class AxisNoise:
     """The noise of one axis."""
 
-    form: tuple[str, ...]
-    """Names of the processes that make the slow part; empty: none shows."""
     terms: dict[str, Term]
     """Name of the process -> its figure; 'correlation_time' in addition to 'gauss_markov'."""
-    others: tuple[tuple[str, ...], ...]
+    form: tuple[str, ...] = ()
+    """Names of the processes that make the slow part; empty: none shows."""
+    others: tuple[tuple[str, ...], ...] = ()
     """Other forms that explain the curve as well."""
-    alternatives: dict[str, Term]
+    alternatives: dict[str, Term] = field(default_factory=dict)
     """Figures of processes that occur only in these forms."""
-    fit: MomentFit
-    """The fitted model."""
-    shortest: float
-    """Shortest averaging time that was fitted, s."""
-    excess: float
+    shortest: float = 0.0
+    """Shortest averaging time that was fitted, s; longer than the period where the sensor filters its noise."""
+    excess: float = 1.0
     """Factor on all covariances because the misfit exceeds the sampling error, at least 1."""
     oscillation: tuple[float, float] | None = None
     """Frequency (Hz) and amplitude: of the sine with the largest hump that no model explains; from a recording, of its line."""
     scatter: float = 0.0
     """Standard deviation of the level of the variances from rest to rest, over the level."""
+    fit: Any = None
+    """The fitted model (MomentFit); None: from a document."""
 
 
 def identify_axis(moments: Moments) -> AxisNoise:
@@ -240,8 +241,9 @@ def identify_axis(moments: Moments) -> AxisNoise:
     for other in (*rivals, *filter(None, [choice.close(GAUSS_MARKOV)])):
         for name in set(other.form) - set(best.form) - set(alternatives):
             alternatives |= _figures(choice, name, excess)
-    return AxisNoise(best.form, _doubted(terms, best, rivals), tuple(rival.form for rival in rivals), alternatives, best.fit,
-                     float(moments.scales.tau[moments.used][0]), excess, _hump(moments, best.fit) if excess > 1 else None, moments.scatter)
+    return AxisNoise(_doubted(terms, best, rivals), best.form, tuple(rival.form for rival in rivals), alternatives,
+                     float(moments.scales.tau[moments.used][0]), excess, _hump(moments, best.fit) if excess > 1 else None, moments.scatter,
+                     best.fit)
 
 
 def scatter_of(moments: Moments) -> float:

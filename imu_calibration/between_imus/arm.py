@@ -165,9 +165,9 @@ def _robust_fit(design, target, alpha_noise):
     return values, weights, weight_fall, excess
 
 
-def jackknife_covariance(fit: Fit, centres: np.ndarray, cluster: float) -> np.ndarray:
+def jackknife_covariance(fit: Fit, centres: np.ndarray) -> np.ndarray:
     """Delete-one-cluster jackknife over stretches of time: errors within a stretch may have any correlation."""
-    label = np.unique(np.floor((centres - centres[0]) / cluster).astype(int), return_inverse=True)[1]
+    label = np.unique(np.floor((centres - centres[0]) / CLUSTER).astype(int), return_inverse=True)[1]
     shifts = []
     for group in range(label.max() + 1):
         inside = label == group
@@ -325,7 +325,7 @@ def _matrix_covariance(calibration):
 
 
 def _result(rows, fit, delay, rotation, streams):
-    motion = jackknife_covariance(fit, rows.centres, CLUSTER)[:3, :3]
+    motion = jackknife_covariance(fit, rows.centres)[:3, :3]
     shift = response(fit, -skew(rows.force))
     calibration, turned = _calibration_covariance(fit, rows, *streams), (shift @ rotation.cov @ shift.T)[:3, :3]
     total = motion + calibration + turned

@@ -37,8 +37,6 @@ class Derived:
     """Reading at zero input, SI, shape (3,)."""
     bias_sd: np.ndarray
     """Its standard deviation, shape (3,)."""
-    input_bias: np.ndarray
-    """Input that would give the same reading, ``matrix^-1 @ bias`` (Zhang 2017, eq. 8), SI, shape (3,)."""
 
 
 AXIS_PAIRS = ((0, 1), (1, 2), (0, 2))
@@ -66,8 +64,7 @@ def derive(calibration: Calibration, sensor: str) -> Derived:
     angles_sd = np.array([[_angle_sd(axes[i], j, spread[i]) for j in range(3)] for i in range(3)])
     between = np.array([_angle(axes[i], axes[j]) for i, j in AXIS_PAIRS])
     between_sd = np.array([_between_sd(axes, tangent, covariance, i, j) for i, j in AXIS_PAIRS])
-    return Derived(sensor, scale, scale_sd, angles_of(axes), angles_sd, between, between_sd, bias, calibration.sd[offset],
-                   np.linalg.solve(matrix, bias))
+    return Derived(sensor, scale, scale_sd, angles_of(axes), angles_sd, between, between_sd, bias, calibration.sd[offset])
 
 
 def split(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,7 @@
 """``imu_calibration compare``: whether two calibrations agree."""
 
 from argparse import Namespace
+from dataclasses import asdict
 
 from imu_calibration.cli.parser import OneLineParser, VerbResult
 
@@ -31,6 +32,4 @@ def run(options: Namespace) -> VerbResult:
     show_table(out, ('parameter', *numbers[:-1], 'unit', 'in sd'), shown, numbers=numbers)
     for line in result.lines:
         out.print(line)
-    rows = [{'name': row.name, 'first': row.first, 'second': row.second, 'sd': row.sd, 'unit': row.unit, 'ratio': row.ratio}
-            for row in result.rows]
-    return VerbResult(0, {'rows': rows, 'lines': list(result.lines)})
+    return VerbResult(0, {'rows': [asdict(row) for row in result.rows], 'lines': list(result.lines)})

@@ -66,7 +66,7 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     at_arm = [_sum(arm, products[start:start + 3]) for start in (0, 3, 6)]
     slope = _turned(gyro.inverse, _vector('a'))
     lines = ['def kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch=0.0, sx=0.0, sy=0.0, sz=0.0):']
-    if gyro.uses <= BEFOREHAND and accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'} and not accel.bends_with('g'):
+    if gyro.uses <= BEFOREHAND and accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'} and not accel.bends:
         # No iteration is needed: the rate follows from the readings, and the disturbance of the force follows from the rate.
         lines += _assigned('v', _less(gyro.alone, gyro.rest), '    ')
         force = [_with_slope(row, slope) for row in _less(_less(accel.alone, accel.rest), at_arm)]
@@ -96,10 +96,10 @@ class _Part:
                 self.rest = [added(row, _sum(block[:, axis], columns)) for axis, row in enumerate(self.rest)]
                 self.uses |= group.uses
 
-    def bends_with(self, letter):
-        """Return whether a variable enters the rest in a product or a function."""
-        return any(re.search(rf'\b{letter}[xyz]\b',
-                             ' '.join(factors)) and len(' '.join(factors)) > 2 for row in self.rest for factors in row)
+    @property
+    def bends(self):
+        """Whether the angular acceleration enters the rest in a product or a function."""
+        return any(re.search(r'\bg[xyz]\b', ' '.join(factors)) and len(' '.join(factors)) > 2 for row in self.rest for factors in row)
 
 
 def _known(temperature_ref_c):

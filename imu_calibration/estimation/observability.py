@@ -80,9 +80,9 @@ def _spin(axis, speeds, up=None, arm=None):
     return make
 
 
-def _oscillation(axis, degrees, hertz, up=None):
+def _oscillation(axis, up=None):
     def make(gravity):
-        w, a = 2 * np.pi * hertz, degrees * DEG
+        w, a = 2 * np.pi, 30 * DEG
         return [_turn(axis, MOTION_TIME, a * np.sin(w * MOTION_TIME), a * w * np.cos(w * MOTION_TIME), -a * w**2 * np.sin(w * MOTION_TIME),
                       gravity, (0.3, 0.4, 1.0) if up is None else up)]
     return make
@@ -144,7 +144,7 @@ def _spins_about(axis, up=None):
 
 def _oscillates_about(axis, up=None):
     name = 'xyz'[axis.index(1)]
-    return Motion(f'oscillate_{name}', f"oscillate about the sensor's {name} axis, 30 deg at 1 Hz", _oscillation(axis, 30, 1.0, up), axis)
+    return Motion(f'oscillate_{name}', f"oscillate about the sensor's {name} axis, 30 deg at 1 Hz", _oscillation(axis, up), axis)
 
 
 MOTIONS = (

@@ -227,18 +227,18 @@ def slow_part(rows: np.ndarray, length: int) -> np.ndarray:
     return rows[:pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(max(length, 1)) if pieces else rows[:0]
 
 
-def batch_statistics(output: np.ndarray, batches: int = BATCHES) -> tuple[np.ndarray, np.ndarray]:
+def batch_statistics(output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the variance of each column and the factor by which means of it scatter more than white noise.
 
-    The factor is the variance of the means of `batches` equal pieces, times their length, over the sample variance:
+    The factor is the variance of the means of `BATCHES` equal pieces, times their length, over the sample variance:
     a sensor's low-pass filter makes it larger than one. Pieces exclude slow drift.
     """
     variance = output.var(axis=0, ddof=1)
-    length = len(output) // batches
+    length = len(output) // BATCHES
     if length < 2:
         return variance, np.ones(output.shape[1])
-    means = output[:length * batches].reshape(batches, length, -1).mean(axis=1)
+    means = output[:length * BATCHES].reshape(BATCHES, length, -1).mean(axis=1)
     with np.errstate(divide='ignore', invalid='ignore'):
         factor = np.diff(means, axis=0).var(axis=0, ddof=0) / 2 * length / variance
     return variance, np.where(np.isfinite(factor), factor, 1.0)

@@ -167,10 +167,6 @@ class MotionLimits:
         """Return the limits with rotating joints restricted to `reach_deg` on either side of a position; sliding joints do not change."""
         return self.around(position, np.where(self.turns, reach_deg * DEG, 0.0))
 
-    def hold(self, position: np.ndarray, margin: float = 1e-9) -> bool:
-        """Whether every position, shape (..., n_joints), lies within the range."""
-        return bool(np.all(position >= self.lower - margin) and np.all(position <= self.upper + margin))
-
 
 def free_limits(n_joints: int) -> MotionLimits:
     """Return the limits of joints that turn without end at the usual speed."""

@@ -108,10 +108,6 @@ class PlannerWorker(threading.Thread):
             self.driver.stop(why)
         self._peers.stop()
 
-    def forget(self) -> None:
-        """Plan again at the next start."""
-        self.campaign = None
-
     def end(self, timeout: float = 10.0) -> None:
         """End the thread, and stop the joints."""
         self._ending = True

@@ -84,15 +84,15 @@ def gravity_readings(mat_bn: np.ndarray, gravity_axis: str, tilt_rad: Sequence[f
     return mat_bn @ tilted_gravity(gravity_axis, tilt_rad)
 
 
-def series_3(rate_deg_s: float | None = None) -> np.ndarray:
+def series_3() -> np.ndarray:
     """Return the rates of sample 3, deg/s, shape (n, 3): w, w^(1/2), w^(1/3) for w = 0, 10 ... 100 (11 runs, the paper says 10)."""
-    rate = np.arange(0.0, 101.0, 10.0) if rate_deg_s is None else np.asarray(rate_deg_s, float)
+    rate = np.arange(0.0, 101.0, 10.0)
     return np.column_stack([rate, np.sqrt(rate), np.cbrt(rate)])
 
 
-def series_4(rate_deg_s: float | None = None) -> np.ndarray:
+def series_4() -> np.ndarray:
     """Return the rates of sample 4, deg/s, shape (n, 3): w, exp(-w), w^2 for w = 0, 1 ... 10."""
-    rate = np.arange(0.0, 11.0) if rate_deg_s is None else np.asarray(rate_deg_s, float)
+    rate = np.arange(0.0, 11.0)
     return np.column_stack([rate, np.exp(-rate), rate**2])
 
 
@@ -102,11 +102,10 @@ def factorial_rates(rate_deg_s: float = 10.0, n_static: int = 3) -> np.ndarray:
     return np.vstack([rate_deg_s * corners, np.zeros((n_static, 3))])
 
 
-def add_earth_rate(rate_deg_s: np.ndarray, along_spin_axis_deg_s: float,
-                   axis_at_rest: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> np.ndarray:
+def add_earth_rate(rate_deg_s: np.ndarray, along_spin_axis_deg_s: float) -> np.ndarray:
     """Return body rates that include Earth rate's component along the spin axis; the rest averages out over full turns."""
     size = np.linalg.norm(rate_deg_s, axis=1, keepdims=True)
-    axis = np.where(size > 0, rate_deg_s / np.where(size > 0, size, 1.0), axis_at_rest)
+    axis = np.where(size > 0, rate_deg_s / np.where(size > 0, size, 1.0), (1.0, 0.0, 0.0))
     return rate_deg_s + along_spin_axis_deg_s * axis
 
 
@@ -150,28 +149,6 @@ def calibrate_as_printed(inputs: np.ndarray, outputs: np.ndarray, model: str = '
     """Return X by the printed normal equations ``inv(G'G) G'U``, to show what they lose."""
     design = design_matrix(inputs, model)
     return np.linalg.inv(design.T @ design) @ design.T @ outputs
-
-
-def calibrate_separate_sets(static: tuple[np.ndarray, np.ndarray], spinning: tuple[np.ndarray, np.ndarray],
-                            accelerometer_model: str = 'linear', *,
-                            gyroscope_model: str = 'linear') -> tuple[LinearSolution, LinearSolution]:
-    """
-    Calibrate the two sets apart, as the paper does: accelerometers from positions at rest, gyroscopes from constant-rate runs.
-
-    Parameters
-    ----------
-    static : tuple of arrays (n, 3)
-        Reference specific force and mean accelerometer outputs per position.
-    spinning : tuple of arrays (m, 3)
-        Reference rate (with Earth rate when it is known) and mean gyroscope outputs per run.
-
-    Returns
-    -------
-    tuple of LinearSolution
-        Accelerometers, gyroscopes.
-
-    """
-    return calibrate(*static, accelerometer_model), calibrate(*spinning, gyroscope_model)
 
 
 def _axis_turn(axis, angle):

@@ -23,48 +23,21 @@ class LinearSolution:
     """Names of the parameters."""
     unit_covariance: np.ndarray
     """Covariance for output noise of sd 1 (of sd 1/sqrt(weight) with weights), shape (n_params, n_params)."""
-    sigma: np.ndarray
-    """Sd of unit weight estimated from the residuals, scalar array or shape (n_outputs,); NaN without redundancy."""
     residuals: np.ndarray
     """Outputs minus prediction, not weighted, shape of the outputs."""
-    dof: int
-    """Rows of non-zero weight minus parameters."""
-    rank: int
-    """Numerical rank of the unit-column design; equal to the number of parameters here."""
     cond: float
     """Condition number of the (weighted) design in the units it came in."""
     eqcond: float
     """Condition number after every column is scaled to unit norm; independent of units."""
-    singular_values: np.ndarray
-    """Singular values of the unit-column design, descending, shape (n_params,)."""
 
     @property
     def unit_sd(self) -> np.ndarray:
         """Sd of each parameter for output noise of sd 1, shape (n_params,)."""
         return np.sqrt(np.diag(self.unit_covariance))
 
-    @property
-    def sd(self) -> np.ndarray:
-        """Sd of each parameter with the estimated sigma, shape of `values`."""
-        return np.multiply.outer(self.unit_sd, self.sigma)
 
-    @property
-    def covariance(self) -> np.ndarray:
-        """Covariance with the estimated sigma, shape (n_params, n_params) or (n_outputs, n_params, n_params)."""
-        return np.multiply.outer(self.sigma**2, self.unit_covariance)
-
-    @property
-    def chi2_per_dof(self) -> np.ndarray:
-        """Weighted residual sum of squares per degree of freedom, shape of `sigma`."""
-        return self.sigma**2
-
-    def value(self, name: str) -> float:
-        """Return the parameter called `name`."""
-        return self.values[self.param_names.index(name)]
-
-
-def solve_linear(design: np.ndarray, outputs: np.ndarray, param_names: tuple[str, ...], *, weights: np.ndarray | None = None,
-                 rank_tolerance: float = RANK_TOLERANCE) -> LinearSolution:
+def solve_linear(design: np.ndarray, outputs: np.ndarray, param_names: tuple[str, ...], *,
+                 weights: np.ndarray | None = None) -> LinearSolution:
     """
     Solve ``outputs = design @ values`` by least squares through the SVD of the unit-column design.
 
@@ -78,8 +51,6 @@ def solve_linear(design: np.ndarray, outputs: np.ndarray, param_names: tuple[str
         One name per column of the design.
     weights : array, shape (n,), optional
         Inverse variances of the observations.
-    rank_tolerance : float
-        Relative singular value (unit columns) below which the system counts as singular.
 
     Returns
     -------
@@ -95,7 +66,7 @@ def solve_linear(design: np.ndarray, outputs: np.ndarray, param_names: tuple[str
     """
     design, outputs, names, root = _checked(design, outputs, param_names, weights)
     norms, left, singular, right = _scaled_svd(design * root[:, None])
-    _require_full_rank(design, norms, singular, right, names, rank_tolerance)
+    _require_full_rank(design, norms, singular, right, names)
 
     def fit(target):
         weighted = (target.T * root).T
@@ -103,20 +74,15 @@ def solve_linear(design: np.ndarray, outputs: np.ndarray, param_names: tuple[str
 
     values = fit(outputs).T
     values = values + fit(outputs - design @ values).T  # one refinement step: the residual is formed at full precision
-    residuals = outputs - design @ values
-    dof = int(np.count_nonzero(root)) - len(names)
-    rss = np.sum(((residuals.T * root) ** 2), axis=-1)
-    sigma = np.sqrt(rss / dof) if dof > 0 else np.full(np.shape(rss), np.nan)
     inverse = right.T / singular / norms[:, None]
     raw = np.linalg.svd(design * root[:, None], compute_uv=False)
-    return LinearSolution(values, names, inverse @ inverse.T, np.asarray(sigma), residuals, dof, len(names),
-                          _ratio(raw), _ratio(singular), singular)
+    return LinearSolution(values, names, inverse @ inverse.T, outputs - design @ values, _ratio(raw), _ratio(singular))
 
 
-def numerical_rank(design: np.ndarray, rank_tolerance: float = RANK_TOLERANCE) -> int:
+def numerical_rank(design: np.ndarray) -> int:
     """Return the rank of `design` after its columns are scaled to unit norm; zero columns count as zero."""
     singular = _scaled_svd(np.asarray(design, float))[2]
-    return int(np.sum(singular > rank_tolerance * max(singular[0], np.finfo(float).tiny)))
+    return int(np.sum(singular > RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)))
 
 
 def condition_numbers(design: np.ndarray) -> tuple[float, float]:
@@ -125,7 +91,7 @@ def condition_numbers(design: np.ndarray) -> tuple[float, float]:
     return _ratio(np.linalg.svd(design, compute_uv=False)), _ratio(_scaled_svd(design)[2])
 
 
-def null_directions(design: np.ndarray, param_names: tuple[str, ...], rank_tolerance: float = RANK_TOLERANCE) -> list[dict[str, float]]:
+def null_directions(design: np.ndarray, param_names: tuple[str, ...]) -> list[dict[str, float]]:
     """
     Return the combinations of parameters that leave every output unchanged, as a list of {name: weight}.
 
@@ -134,7 +100,7 @@ def null_directions(design: np.ndarray, param_names: tuple[str, ...], rank_toler
 
     """
     norms, _, singular, right = _scaled_svd(np.asarray(design, float))
-    weak = right[singular <= rank_tolerance * max(singular[0], np.finfo(float).tiny)]
+    weak = right[singular <= RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)]
     return [] if len(weak) == 0 else _echelon(weak, norms, tuple(param_names))
 
 
@@ -177,9 +143,9 @@ class ToleranceScaled:
         """Largest over smallest singular value."""
         return _ratio(self.singular_values)
 
-    def weak_directions(self, param_names: tuple[str, ...], threshold: float = 1.0, share: float = 0.1) -> list[dict[str, float]]:
-        """Return [{name: weight}] for directions whose sd exceeds tolerance/threshold, the weakest first."""
-        rows = self.directions[self.singular_values < threshold][::-1]
+    def weak_directions(self, param_names: tuple[str, ...], share: float = 0.1) -> list[dict[str, float]]:
+        """Return [{name: weight}] for directions whose sd exceeds the tolerance, the weakest first."""
+        rows = self.directions[self.singular_values < 1.0][::-1]
         return [{name: float(w) for name, w in zip(param_names, row) if abs(w) >= share * np.max(np.abs(row))} for row in rows]
 
 
@@ -198,7 +164,7 @@ def tolerance_scaled(design: np.ndarray, tolerances: np.ndarray, sigma: float = 
     """
     design = np.asarray(design, float) / np.broadcast_to(np.asarray(sigma, float), len(design))[:, None]
     tolerances = np.asarray(tolerances, float)
-    singular, right = np.linalg.svd(_square_factor(design * tolerances))[1:]
+    singular, right = np.linalg.svd(np.linalg.qr(_padded(design * tolerances), mode='r'))[1:]
     return ToleranceScaled(singular, right, predicted_sd(design) / tolerances)
 
 
@@ -231,16 +197,12 @@ def _padded(design):
     return np.vstack([design, np.zeros((missing, design.shape[1]))]) if missing > 0 else design
 
 
-def _square_factor(design):
-    return np.linalg.qr(_padded(design), mode='r')
-
-
 def _ratio(singular):
     return float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf
 
 
-def _require_full_rank(design, norms, singular, right, names, rank_tolerance):
-    weak = singular <= rank_tolerance * max(singular[0], np.finfo(float).tiny)
+def _require_full_rank(design, norms, singular, right, names):
+    weak = singular <= RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)
     if np.any(weak):
         directions = _echelon(right[weak], norms, names)
         raise NotObservableError(

@@ -49,11 +49,6 @@ class StaticModel:
         """Installation angles in degrees, shape (3, 3)."""
         return np.rad2deg(np.arccos(np.clip(self.cosines, -1, 1)))
 
-    @property
-    def bias_force(self) -> np.ndarray:
-        """Equivalent zero bias in the body frame (eq. 8), force units, shape (3,)."""
-        return np.linalg.solve(self.matrix, self.bias)
-
     def predict(self, force_b: np.ndarray) -> np.ndarray:
         """Return the outputs for specific forces in the body frame, shape (n, 3)."""
         return np.asarray(force_b) @ self.matrix.T + self.bias
@@ -78,12 +73,12 @@ def static_model_from_matrix(matrix: np.ndarray, bias: np.ndarray) -> StaticMode
     return StaticModel(scale, matrix / scale[:, None], np.asarray(bias, float))
 
 
-def six_positions(force: float = 1.0) -> np.ndarray:
+def six_positions() -> np.ndarray:
     """Return the specific forces of the six faces, shape (6, 3): x, y, z up, then x, y, z down."""
-    return force * np.vstack([np.eye(3), -np.eye(3)])
+    return np.vstack([np.eye(3), -np.eye(3)])
 
 
-def fit_static(force_b: np.ndarray, outputs: np.ndarray, weights: np.ndarray | None = None) -> tuple[StaticModel, LinearSolution]:
+def fit_static(force_b: np.ndarray, outputs: np.ndarray) -> tuple[StaticModel, LinearSolution]:
     """
     Estimate scale factors, nine installation angles and zero biases from means at rest (section 3.1, step 4).
 
@@ -93,8 +88,6 @@ def fit_static(force_b: np.ndarray, outputs: np.ndarray, weights: np.ndarray | N
         Reference specific force in the body frame.
     outputs : array, shape (n, 3)
         Mean outputs; volts, or m/s^2 for a sensor that comes with a nominal scale.
-    weights : array, shape (n,), optional
-        Inverse variances.
 
     Returns
     -------
@@ -103,7 +96,7 @@ def fit_static(force_b: np.ndarray, outputs: np.ndarray, weights: np.ndarray | N
 
     """
     design = np.column_stack([np.ones(len(force_b)), force_b])
-    solution = solve_linear(design, outputs, ('bias', 'x', 'y', 'z'), weights=weights)
+    solution = solve_linear(design, outputs, ('bias', 'x', 'y', 'z'))
     return static_model_from_matrix(solution.values[1:].T, solution.values[0]), solution
 
 
@@ -163,6 +156,10 @@ def average_rates(arms: np.ndarray, rates: np.ndarray, weighted: bool = True) ->
     return np.average(arms, axis=0, weights=rates**4 if weighted else None)
 
 
+WITHIN_DEG, STILL_DEG_S = 5.0, 0.2
+"""Windows within this angle of a sensor axis are used; slower windows are at rest, faster ones are grouped by rate rounded to 1 deg/s."""
+
+
 @dataclass(frozen=True)
 class AxisReading:
     """One line of Zhang's Table 2 (at rest) or Table 4 (in rotation)."""
@@ -190,7 +187,7 @@ class AxisReading:
 
 
 def axis_readings(measured: np.ndarray, compensated: np.ndarray, reference: np.ndarray, *, rate: np.ndarray,
-                  gravity: float, within_deg: float = 5.0, still_deg_s: float = 0.2) -> list[AxisReading]:
+                  gravity: float) -> list[AxisReading]:
     """
     Return readings at +-1 g, at rest and in rotation, before and after compensation, as lines of Zhang's Tables 2 and 4.
 
@@ -202,10 +199,6 @@ def axis_readings(measured: np.ndarray, compensated: np.ndarray, reference: np.n
         Turn rate of the table in each window, rad/s.
     gravity : float
         Local gravity, m/s^2: the g of the lines.
-    within_deg : float
-        Windows whose reference lies within this angle of a sensor axis are taken.
-    still_deg_s : float
-        Slower than this is at rest; faster windows are grouped by rate rounded to 1 deg/s.
 
     Returns
     -------
@@ -215,11 +208,11 @@ def axis_readings(measured: np.ndarray, compensated: np.ndarray, reference: np.n
     """
     measured, compensated, reference = (np.asarray(a, float).reshape(-1, 3) / gravity for a in (measured, compensated, reference))
     rate_deg_s = np.abs(np.rad2deg(np.asarray(rate, float)))
-    rate_deg_s = np.where(rate_deg_s < still_deg_s, 0.0, np.maximum(np.round(rate_deg_s), 1.0))
+    rate_deg_s = np.where(rate_deg_s < STILL_DEG_S, 0.0, np.maximum(np.round(rate_deg_s), 1.0))
     size = np.linalg.norm(reference, axis=1)
     axis = np.argmax(np.abs(reference), axis=1)
     along = np.take_along_axis(reference, axis[:, None], axis=1)[:, 0] if len(reference) else size
-    near = np.abs(along) >= np.cos(np.deg2rad(within_deg)) * size
+    near = np.abs(along) >= np.cos(np.deg2rad(WITHIN_DEG)) * size
     lines = []
     for key in sorted({(r, -int(np.sign(s)), int(a)) for r, s, a in zip(rate_deg_s[near], along[near], axis[near])}):
         chosen = near & (rate_deg_s == key[0]) & (np.sign(along) == -key[1]) & (axis == key[2])

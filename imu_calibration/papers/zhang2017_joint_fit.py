@@ -124,6 +124,7 @@ def _square_to(axis):
 
 PARAM_NAMES = ('bias', 'm_x', 'm_y', 'm_z', 'r_x', 'r_y', 'r_z')
 """Parameters of one accelerometer: m/s^2, 1, m."""
+MOST_STEPS = 30
 TOLERANCES = np.array([1e-4 * STANDARD_GRAVITY, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
 """0.1 mg, 0.1 mg/g, 0.1 mm."""
 
@@ -175,8 +176,6 @@ class JointFit:
     """Weighted residual sum of squares, shape (n_draws,)."""
     dof: int
     """Rows minus parameters."""
-    iterations: int
-    """Gauss-Newton steps taken."""
 
     @property
     def sd(self) -> np.ndarray:
@@ -184,7 +183,7 @@ class JointFit:
         return np.sqrt(np.einsum('nii->ni', self.covariance))
 
 
-def fit_joint(runs: Sequence[Run], readings: np.ndarray, start: np.ndarray | None = None, *, max_iterations: int = 30) -> JointFit:
+def fit_joint(runs: Sequence[Run], readings: np.ndarray, start: np.ndarray | None = None) -> JointFit:
     """
     Fit bias, matrix row and arm of one accelerometer to static and dynamic runs jointly.
 
@@ -211,7 +210,7 @@ def fit_joint(runs: Sequence[Run], readings: np.ndarray, start: np.ndarray | Non
     outside = np.sum((readings / stack_runs(runs)[2][:, None] - orthogonal @ target) ** 2, axis=0)
     values = _static_start(runs, readings) if start is None else np.tile(np.asarray(start, float), (readings.shape[1], 1))
     previous = np.inf
-    for iteration in range(1, max_iterations + 1):
+    for _ in range(MOST_STEPS):
         slope, rest = _linearise(factor, target, values)
         step, inverse = _solve_stack(slope, rest)
         values = values + step
@@ -222,7 +221,7 @@ def fit_joint(runs: Sequence[Run], readings: np.ndarray, start: np.ndarray | Non
     slope, rest = _linearise(factor, target, values)
     _, inverse = _solve_stack(slope, rest)
     covariance = inverse @ np.swapaxes(inverse, 1, 2)
-    return JointFit(values, covariance, outside + np.sum(rest**2, axis=1), len(readings) - len(PARAM_NAMES), iteration)
+    return JointFit(values, covariance, outside + np.sum(rest**2, axis=1), len(readings) - len(PARAM_NAMES))
 
 
 def fit_triad(runs: Sequence[Run], readings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[JointFit]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import combinations
@@ -54,8 +54,6 @@ class PlannedMotion:
     """Description of the segments."""
     limits: MotionLimits
     """Limits that it keeps, with which the way to it is timed."""
-    number: int = -1
-    """Number in the catalogue."""
 
     @property
     def seconds(self) -> float:
@@ -157,7 +155,7 @@ def candidates(limits: MotionLimits) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def choose_places(table: Table, limits: MotionLimits, count: int) -> np.ndarray:
+def choose_places(table: Table, limits: MotionLimits) -> np.ndarray:
     """
     Return positions whose attitudes have the largest distances, the first at home, shape (n, n_joints).
 
@@ -168,7 +166,7 @@ def choose_places(table: Table, limits: MotionLimits, count: int) -> np.ndarray:
     mats = reference_motion(table, rest_at(tried)).mat_sn
     features = np.concatenate([mats[:, :, 2], HEADING * mats[:, :, 0], HEADING * mats[:, :, 1]], axis=1)
     chosen, distance = [0], np.linalg.norm(features - features[0], axis=1)
-    while len(chosen) < count and distance.max() > 0.05:
+    while len(chosen) < REST_PLACES and distance.max() > 0.05:
         nearly = distance > distance.max() - 1e-6
         chosen.append(int(np.argmax(nearly)))
         distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
@@ -208,16 +206,11 @@ class Repertoire:
         self.table = table
         self.limits = MotionLimits(limits.lower, limits.upper, LIMIT_SHARE * limits.speed, LIMIT_SHARE * limits.acceleration, limits.turns)
         self.names = tuple(table.joint_names)
-        self.spread = choose_places(table, self.limits, REST_PLACES)
-        self.motions = list(self._made())
+        self.spread = choose_places(table, self.limits)
+        self.motions = [PlannedMotion(kind, self.names, place, segments, text, self.limits) for kind, place, segments, text in (
+            *self._rests(), *self._spins(), *self._swings(), *self._together())]
         self.places = np.unique(np.round([motion.place for motion in self.motions], 9), axis=0)
         self.place_of = np.array([int(np.argmin(np.abs(self.places - motion.place).sum(axis=1))) for motion in self.motions])
-
-    def _made(self) -> Iterator[PlannedMotion]:
-        number = 0
-        for kind, place, segments, text in (*self._rests(), *self._spins(), *self._swings(), *self._together()):
-            yield PlannedMotion(kind, self.names, place, segments, text, self.limits, number)
-            number += 1
 
     def _rests(self):
         for place in self.spread:

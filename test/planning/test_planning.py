@@ -143,7 +143,8 @@ def test_the_sd_of_a_plan_stays_below_the_tolerance_by_the_scatter_of_the_noise_
     assert 1.2 < factor < 1.8
     # 20 expected of 400, by counting 4.4 standard deviations apart; the estimate is skewed where chi-square is not
     assert np.mean(exceeded) < 0.1
-    kept = [situation.motions.index(next(m for m in situation.motions if m.number == motion.number)) for motion in plan.motions]
+    kept = [next(k for k, m in enumerate(situation.motions) if (m.kind, m.text) == (motion.kind, motion.text)
+                 and np.array_equal(m.place, motion.place)) for motion in plan.motions]
     cautious = situation.excess(situation.covariance_after(kept, 0, cautious=True)[0])
     assert cautious.max() <= 1 + 1e-6 and (plan.sd / plan.tolerances)[plan.wanted].max() < 0.98
 

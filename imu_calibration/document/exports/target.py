@@ -20,9 +20,9 @@ AXIS_LETTERS = 'XYZ'
 """Axes in the names of parameters."""
 
 
-def commented(lines: list[str], mark: str = '# ') -> str:
+def commented(lines: list[str]) -> str:
     """Return lines as comments; a name in a line cannot end the comment."""
-    return ''.join(f'{mark}{printable(line)}'.rstrip() + '\n' for line in lines)
+    return ''.join(f'# {printable(line)}'.rstrip() + '\n' for line in lines)
 
 
 def yaml_file(comments: list[str], mapping: dict, head: str = '') -> str:
