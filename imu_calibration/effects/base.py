@@ -102,9 +102,9 @@ class Effect:
     """Published name."""
     sensor: str
     """'accelerometer', 'gyroscope' or 'reference'."""
-    components: tuple
+    components: tuple = VECTOR
     """Component labels; the parameter is called SENSOR.EFFECT.COMPONENT."""
-    shape: tuple
+    shape: tuple = (3,)
     """Shape of the value in a calibration document."""
     unit: str | tuple
     """SI unit of every component (or a tuple, one each)."""
@@ -122,7 +122,7 @@ class Effect:
     """Heading in a report; derived from the name where empty."""
     motion: tuple
     """Standard motions (`estimation.observability`) that show it."""
-    compensation: str
+    compensation: str = 'exact'
     """'exact' (inverted), 'flagged' (cannot be inverted, output marked) or 'none' (belongs to the table or the session)."""
     role: Role = Role.TERM
     """Its place in the sensor's equation."""

@@ -124,7 +124,7 @@ def _square_to(axis):
 
 PARAM_NAMES = ('bias', 'm_x', 'm_y', 'm_z', 'r_x', 'r_y', 'r_z')
 """Parameters of one accelerometer: m/s^2, 1, m."""
-MOST_STEPS = 30
+MAX_JOINT_FIT_STEPS = 30
 TOLERANCES = np.array([1e-4 * STANDARD_GRAVITY, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
 """0.1 mg, 0.1 mg/g, 0.1 mm."""
 
@@ -210,7 +210,7 @@ def fit_joint(runs: Sequence[Run], readings: np.ndarray, start: np.ndarray | Non
     outside = np.sum((readings / stack_runs(runs)[2][:, None] - orthogonal @ target) ** 2, axis=0)
     values = _static_start(runs, readings) if start is None else np.tile(np.asarray(start, float), (readings.shape[1], 1))
     previous = np.inf
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_JOINT_FIT_STEPS):
         slope, rest = _linearise(factor, target, values)
         step, inverse = _solve_stack(slope, rest)
         values = values + step

@@ -34,8 +34,6 @@ class Relaxation:
 
     seconds: float
     """Lower bound on the time of every plan, s."""
-    relaxed_seconds: float
-    """Time of the relaxed plan, s; the value of the programme lies between this and the bound."""
     weights: np.ndarray
     """How much each parameter limits the relaxed plan, sum 1, shape (p,)."""
 
@@ -61,14 +59,14 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
     """
     weights = np.full(len(asked), 1.0 / len(asked))
     if _worst(known, asked) <= 1.0:
-        return Relaxation(0.0, 0.0, weights)
+        return Relaxation(0.0, weights)
     if _worst(known + MAX_REACHABLE_SECONDS * np.sum(information / seconds[:, None, None], axis=0), asked) > 1.0:
-        return Relaxation(np.nan, np.nan, weights)
+        return Relaxation(np.nan, weights)
     flat = used = information.reshape(len(seconds), -1)
     kept, root = np.arange(len(seconds)), np.linalg.cholesky(known)
     rows = scipy.linalg.solve_triangular(root, asked.T, lower=True).T
     share = 1.0 / len(seconds) / seconds
-    best = Relaxation(0.0, np.inf, weights)
+    best = Relaxation(0.0, weights)
     for number in range(MAX_WEIGHT_STEPS):
         direction = np.tensordot(share[kept], used, 1).reshape(known.shape)
         scale = _scale(direction, root, rows)
@@ -84,7 +82,7 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
             factor = 1.0 / worth.max()
             bound = factor * (weights @ (2 * variance - 1) - np.sum(known * prices))
             if bound > best.seconds:
-                best = Relaxation(float(bound), relaxed, weights)
+                best = Relaxation(float(bound), weights)
             if relaxed < CERTIFICATE_RATIO * best.seconds:
                 break
             kept = np.flatnonzero((worth > 0.3 * worth.max()) | (share * seconds > 1e-4 * (share @ seconds)))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import perm
 
 import numpy as np
+from scipy.interpolate import BPoly, PPoly
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import setting
@@ -47,37 +47,17 @@ class JointTrajectory:
         """Return the JointMotion at `time`, shape (m,): before the first point as there at rest, after the last at rest."""
         time = np.atleast_1d(np.asarray(time, float))
         inside = np.clip(time, self.time[0], self.time[-1])
-        piece = np.clip(np.searchsorted(self.time, inside, side='right') - 1, 0, len(self.time) - 2)
-        length = np.diff(self.time)[piece][:, None]
-        share = (inside - self.time[piece])[:, None] / length
-        coefficients = [coefficient[piece] for coefficient in self._coefficients]
-        powers = [share**degree for degree in range(len(coefficients))]
-        motion = [_polynomial(coefficients, powers, order) / length**order for order in range(4)]
+        motion = [self._curve(inside, order) for order in range(4)]
         outside = (time < self.time[0]) | (time > self.time[-1])
         for derivative in motion[1:]:
             derivative[outside] = 0.0
         return JointMotion(time, *motion)
 
     @cached_property
-    def _coefficients(self):
-        """Coefficients in the share of the piece, lowest degree first, each shape (n - 1, n_joints)."""
-        length, p0, d = np.diff(self.time)[:, None], self.position[:-1], np.diff(self.position, axis=0)
-        if self.rate is None:
-            return p0, d
-        v0, v1 = self.rate[:-1] * length, self.rate[1:] * length
-        if self.acceleration is None:
-            return p0, v0, 3 * d - 2 * v0 - v1, v0 + v1 - 2 * d
-        a0, a1 = self.acceleration[:-1] * length**2 / 2, self.acceleration[1:] * length**2 / 2
-        d, e, f = d - v0 - a0, v1 - v0 - 2 * a0, 2 * (a1 - a0)
-        return p0, v0, a0, 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2
-
-
-def _polynomial(coefficients, powers, order):
-    """Return the derivative of an order of the polynomial, by the share, of which `powers` are."""
-    total = np.zeros_like(coefficients[0])
-    for degree in range(order, len(coefficients)):
-        total = total + perm(degree, order) * coefficients[degree] * powers[degree - order]
-    return total
+    def _curve(self):
+        """The polynomials (PPoly), each by the quantities that are given at both of its ends."""
+        given = [values for values in (self.position, self.rate, self.acceleration) if values is not None]
+        return PPoly.from_bernstein_basis(BPoly.from_derivatives(self.time, np.stack(given, axis=1)))
 
 
 def trajectory_from(start: JointMotion, points: TrajectoryPoints) -> JointTrajectory:
