@@ -14,7 +14,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError, did_you_mean, shortened
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
-from msg_adapters.csv_log import SUFFIXES, CsvBag, is_csv
+from msg_adapters.csv_log import SUFFIXES, CsvBag
 from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, ImuDecoder, JointDecoder, taken_counts
 from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
@@ -272,7 +272,7 @@ def _open_source(path):
     if not (path.is_dir() or path.is_file()):
         raise InputError(f'a recording must be a folder or a regular file, got {path}, which is a pipe or a device; give a file')
     try:
-        if is_csv(path):
+        if path.suffix.lower() in SUFFIXES:
             return CsvBag(path)
         return Ros1File(path) if path.suffix == '.bag' else Rosbag2(path)
     except InputError:
@@ -291,11 +291,6 @@ def list_topics(path: str | PathLike[str]) -> tuple[Topic, ...]:
         return _listed(source)
     finally:
         source.close()
-
-
-def imu_topics(topics: tuple[Topic, ...]) -> list[str]:
-    """Return the names of the Topics with IMU messages."""
-    return [topic.name for topic in topics if topic.type == IMU_TYPE]
 
 
 def _listed(source):

@@ -103,11 +103,6 @@ class CsvLog:
     """Other columns."""
 
 
-def is_csv(path: str | PathLike[str]) -> bool:
-    """Return whether a path has the suffix of a text log."""
-    return Path(path).suffix.lower() in SUFFIXES
-
-
 @np.errstate(over='ignore', invalid='ignore')   # readings that are not finite are counted where samples are used
 def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
     """

@@ -37,11 +37,6 @@ def standard_definition(message_type: str) -> TypeDefinition:
     return TypeDefinition(message_type, 'ros2msg', store.generate_msgdef(message_type, ros_version=2)[0], store.hash_rihs01(message_type))
 
 
-def is_standard_name(message_type: str) -> bool:
-    """Return whether this package supports the type."""
-    return message_type in STANDARD_TYPES
-
-
 def is_standard(message_type: str, encoding: str, text: str) -> bool:
     """Return whether a definition has the fields of the standard one; without a text the standard is assumed."""
     if not text:

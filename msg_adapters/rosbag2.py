@@ -11,7 +11,7 @@ from typing import Any
 from imu_calibration.core import documents
 from imu_calibration.core.documents import open_regular, parsed
 from imu_calibration.core.errors import InputError, shortened
-from msg_adapters.definitions import TypeDefinition, is_standard, is_standard_name, standard_definition
+from msg_adapters.definitions import STANDARD_TYPES, TypeDefinition, is_standard, standard_definition
 from msg_adapters.layout import clean_name
 from msg_adapters.mcap_records import decompress_file, decompress_message
 from msg_adapters.storages import STORAGES, suffixes
@@ -101,7 +101,7 @@ class Rosbag2:
         """Return the TypeDefinition of a topic; the standard one where the bag has none."""
         message_type = self.types[topic]
         encoding, text = self.definitions.get(message_type, ('', ''))
-        if is_standard_name(message_type) and is_standard(message_type, encoding, text):
+        if message_type in STANDARD_TYPES and is_standard(message_type, encoding, text):
             return standard_definition(message_type)
         digest = self._entry(topic).get('type_description_hash', '')
         return TypeDefinition(message_type, encoding if text else '', text, digest)

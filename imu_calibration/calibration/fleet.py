@@ -1,6 +1,6 @@
 """Many units: the map step calibrates one, the merge step compares them. Plain functions, for any scheduler."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -152,8 +152,3 @@ def _spread(name, unit, found):
     low, high = found[int(np.argmin(value))], found[int(np.argmax(value))]
     spread = float(value.std(ddof=1)) if len(value) > 1 else float('nan')
     return Spread(name, unit, len(value), float(value.mean()), spread, float(np.sqrt(np.mean(sd**2))), (low[0], low[2]), (high[0], high[2]))
-
-
-def fleet_exit_code(results: Iterable[UnitResult]) -> int:
-    """Return 0 when the exit code of every unit is 0, else 3."""
-    return 0 if all(result.exit_code == 0 for result in results) else 3

@@ -177,18 +177,12 @@ def calibrate_without_table(sources: Sequence[Callable], options: CalibrationOpt
         raise InputError(f'calibration by hand needs one recording, got {len(sources)}; calibrate them separately and compare the results')
     preflight = Preflight(options.gravity)
     recording = read_by_hand(sources[0](), options.nominal, [preflight])
-    return calibrate_samples_by_hand(recording, options, provenance, findings=preflight.findings)
-
-
-def calibrate_samples_by_hand(recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None,
-                              *, stills: Sequence[slice] | None = None, findings: Sequence[CheckFinding] = ()) -> HandResult:
-    """Return the HandResult of a HandRecording; `stills` as in `calibrate_by_hand`, `findings` of a check of the recording."""
-    return evident_result(recording, options, provenance, stills=stills, findings=findings)[0]
+    return evident_result(recording, options, provenance, findings=preflight.findings)[0]
 
 
 def evident_result(recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None, *,
                    stills: Sequence[slice] | None = None, findings: Sequence[CheckFinding] = ()) -> tuple[HandResult, EvidentHand]:
-    """Return (the HandResult, the search results); arguments as in `calibrate_samples_by_hand`."""
+    """Return (the HandResult, the search results); `stills` as in `calibrate_by_hand`, `findings` of a check."""
     asked = hand_options(options)
     data = gather_by_hand(recording.imu, stills, temperature_c=recording.temperature_c)
     evident = solve_by_evidence(data, asked, as_asked=options.as_asked)

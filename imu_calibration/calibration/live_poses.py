@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.calibration.coverage import Coverage, GroupState, group_states, waiting_groups
-from imu_calibration.calibration.hand_workflow import HandRecording, HandResult, calibrate_samples_by_hand
+from imu_calibration.calibration.hand_workflow import HandRecording, HandResult, evident_result
 from imu_calibration.calibration.pose_scan import NO_FINDINGS, hand_coverage, hand_status, look_for_poses
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SessionStatus, SolvePacer
 from imu_calibration.core.errors import InputError, NotObservableError
@@ -182,7 +182,7 @@ class LiveByHand:
                                      'check the topic', code='no_samples')
         self._search(store)
         recording = HandRecording(imu, None, self.counts)
-        self.result = calibrate_samples_by_hand(recording, self.options, provenance, stills=self.found.rests)
+        self.result = evident_result(recording, self.options, provenance, stills=self.found.rests)[0]
         return self.result
 
     def needs_linearising(self) -> bool:

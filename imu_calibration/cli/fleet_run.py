@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from imu_calibration.calibration.fleet import FleetStep, Spread, Unit, UnitResult, fleet_exit_code, summarise
+from imu_calibration.calibration.fleet import FleetStep, Spread, Unit, UnitResult, summarise
 from imu_calibration.cli.arguments import choices_of, stand_of
 from imu_calibration.cli.parser import VerbResult, hints_of
 from imu_calibration.cli.show import show_table, warn
@@ -103,7 +103,8 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
             files.write_text(folder / name, csv_text(table))
         files.write_text(folder / 'summary.html', summary_html(results, spreads))
         show_fleet(results, spreads, folder, hints=hints_of(options))
-    return VerbResult(fleet_exit_code(results), {'units': rows['units.csv'], 'parameters': rows['summary.csv']})
+    return VerbResult(3 if any(result.exit_code for result in results) else 0,
+                      {'units': rows['units.csv'], 'parameters': rows['summary.csv']})
 
 
 def _table(options, bags):

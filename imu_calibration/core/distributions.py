@@ -7,7 +7,7 @@ all remaining modules together, and every command and node would wait for it.
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import bdtrc, chdtrc, chdtri, fdtrc, ndtr, ndtri
+from scipy.special import bdtrc, chdtrc, chdtri, fdtrc, ndtr
 
 
 def chi2_sf(x: ArrayLike, dof: ArrayLike) -> np.ndarray:
@@ -33,11 +33,6 @@ def binom_sf(x: ArrayLike, trials: ArrayLike, chance: float) -> np.ndarray:
 def norm_sf(x: ArrayLike) -> np.ndarray:
     """Return the probability that a standard Gaussian number lies above `x`."""
     return ndtr(-np.asarray(x))
-
-
-def norm_ppf(chance: ArrayLike) -> np.ndarray:
-    """Return the value below which a standard Gaussian number lies with probability `chance`."""
-    return ndtri(chance)
 
 
 def chance_of_fall(fall: float, added: int, *, rest: float, spare: float) -> float:

@@ -9,8 +9,9 @@ from typing import Protocol
 
 import numpy as np
 import scipy.linalg
+from scipy.special import ndtri
 
-from imu_calibration.core.distributions import chi2_isf, norm_ppf
+from imu_calibration.core.distributions import chi2_isf
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import all_arms, coefficient_jacobian
 from imu_calibration.effects.sensor_model import SensorModel
@@ -228,5 +229,5 @@ def enough(size: int, questions: int) -> float:
 
     threshold = chi2_isf(FAMILY_WISE / questions, size)
     named = next(value for value in np.geomspace(1.0, 1e4, 2000) if ncx2.sf(threshold, size, value) >= SEPARATION_PROBABILITY)
-    quantile = norm_ppf(SEPARATION_PROBABILITY)
+    quantile = ndtri(SEPARATION_PROBABILITY)
     return float(max(named, (quantile + np.sqrt(quantile**2 + 2 * TIE))**2))

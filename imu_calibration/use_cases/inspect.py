@@ -19,7 +19,8 @@ from imu_calibration.references.gravity.hand_options import hand_options
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.gathered import Gathered
 from imu_calibration.use_cases.recordings import Source, Topics, open_bag, source_of
-from msg_adapters.bag import Recording, imu_topics, list_topics
+from msg_adapters.bag import Recording, list_topics
+from msg_adapters.imu import IMU_TYPE
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +57,7 @@ class Look:
 
 def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
     """Return the topics with the requested Imu topic, or with each one of the recording, and each frame_id if one has several."""
-    names = [topics.imu] if topics.imu is not None else imu_topics(list_topics(bag))
+    names = [topics.imu] if topics.imu is not None else [topic.name for topic in list_topics(bag) if topic.type == IMU_TYPE]
     found = [topics._replace(imu=name) for name in names]
     if topics.frame is None:
         found = [part for each in found for part in _by_frame(bag, each)]

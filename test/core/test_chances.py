@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from imu_calibration.core.distributions import binom_sf, chi2_isf, chi2_sf, f_sf, norm_ppf, norm_sf
+from imu_calibration.core.distributions import binom_sf, chi2_isf, chi2_sf, f_sf, norm_sf
 
 RNG = np.random.default_rng(1)
 VALUES = np.concatenate([RNG.exponential(10.0, 300), RNG.normal(0.0, 3.0, 200), [0.0, 1e-300, 1e300, np.inf, -np.inf, np.nan]])
@@ -30,7 +30,6 @@ def test_binomial_numbers_have_the_tail_of_scipy_stats():
 
 def test_gaussian_numbers_have_the_tails_of_scipy_stats():
     np.testing.assert_array_equal(norm_sf(VALUES), stats.norm.sf(VALUES))
-    np.testing.assert_array_equal(norm_ppf(CHANCES), stats.norm.ppf(CHANCES))
 
 
 def test_each_value_has_its_own_degrees_of_freedom():

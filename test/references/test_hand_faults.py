@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.calibration.advice import missing_motion
-from imu_calibration.calibration.hand_workflow import HandRecording, calibrate_samples_by_hand, read_by_hand
+from imu_calibration.calibration.hand_workflow import HandRecording, evident_result, read_by_hand
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
@@ -207,7 +207,7 @@ def test_what_was_left_out_does_not_come_back_in_the_proof():
     imu, ranges, _ = hold_and_turn(0, rate_hz=50.0, still=2.0, n_poses=16)
     rate = imu.rate_s.copy()
     rate[ranges[3].stop + 20:ranges[3].stop + 25, 1] += 4.0
-    clean, found = (calibrate_samples_by_hand(HandRecording(samples, None, {}), CalibrationOptions(gravity=GRAVITY), stills=ranges)
+    clean, found = (evident_result(HandRecording(samples, None, {}), CalibrationOptions(gravity=GRAVITY), stills=ranges)[0]
                     for samples in (imu, replace(imu, rate_s=rate)))
     assert found.hand.statistics['left_out'] == {'contradicted by gravity': 1}
     assert found.calibration.proof['gyroscope']['after'] < 2 * clean.calibration.proof['gyroscope']['after']
@@ -289,7 +289,7 @@ def test_a_gravity_of_no_place_on_the_earth_is_refused(gravity):
 
 def test_the_error_budget_lists_an_unknown_gravity_under_gravity_and_the_given_standard_one_as_known():
     imu, ranges, _ = hold_and_turn(3, n_poses=14)
-    unknown, given = (calibrate_samples_by_hand(HandRecording(imu, None, {}), CalibrationOptions(gravity=gravity, as_asked=True), stills=ranges)
+    unknown, given = (evident_result(HandRecording(imu, None, {}), CalibrationOptions(gravity=gravity, as_asked=True), stills=ranges)[0]
                       for gravity in (None, STANDARD_GRAVITY))
     scale = unknown.calibration.param_names.index('accelerometer.matrix.xx')
     budgets = [result.error_budget() for result in (unknown, given)]
