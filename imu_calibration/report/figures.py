@@ -190,7 +190,8 @@ def _spectra(figure, tones):
         axes.axhline(MIN_LINE_POWER, color=GREY, lw=0.6)
         axes.axvline(tone.frequency, color=INK, lw=0.8, ls=':')
         log_axis(axes.yaxis)
-        axes.set_ylabel(f'{tone.sensor} {tone.axis}: power / around')
+        axes.set_title(f'{tone.sensor} {tone.axis}')
+        axes.set_ylabel('relative power')
         axes.set_xlabel('frequency, Hz' if tone.joint is None else f'cycles per turn of {tone.joint}')
 
 

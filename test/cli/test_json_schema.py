@@ -30,7 +30,7 @@ LONG = {
     'calibrate': [SESSION, '--table', TABLE, '--output', 'found'], 'compensate': [SESSION, '--calibration', 'found/calibration.yaml', '--output', 'corrected'],
     'check': [SESSION, '--table', TABLE, '--calibration', 'found/calibration.yaml'], 'diagnose': [SESSION, '--table', TABLE, '--output', 'diagnosed'],
     'noise': [SESSION, '--output', 'noise'], 'view': [SESSION, '--table', TABLE, '--model-as-asked', '--output', 'view.mcap'],
-    'fleet': ['units', '--table', TABLE, '--no-report', '--jobs', '1', '--output', 'fleet'], 'plan': ['--table', TABLE, '--no-report', '--no-bound', '--output', 'plan_table'],
+    'fleet': ['units', '--table', TABLE, '--model-as-asked', '--no-report', '--jobs', '1', '--output', 'fleet'], 'plan': ['--table', TABLE, '--no-report', '--no-bound', '--output', 'plan_table'],
 }
 ELSEWHERE = {'arm', 'watch'}
 

@@ -15,6 +15,8 @@ from msg_adapters.write import write_session
 
 from worlds.hand_sessions import simulate
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / 'bags' / 'sample_session'
 

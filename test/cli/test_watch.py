@@ -13,6 +13,8 @@ import pytest
 from imu_calibration.cli.terminal import Terminal
 from imu_calibration.cli.watch import BAR, NodeStatus, bar, ratio_of, screen
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 STATUSES = {
     'streams': NodeStatus(0, 'Imu messages come', {}),
     'calibration': NodeStatus(1, 'weak; accelerometer.bias.x: 3 mg', {}),

@@ -28,6 +28,8 @@ from imu_calibration.use_cases.calibrate import calibrate
 
 from worlds.stands import stand
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 MINE = """
 effects:
   gyro_warm_force:

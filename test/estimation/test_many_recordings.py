@@ -23,6 +23,8 @@ from imu_calibration.simulation.session import SimulationOptions, random_values,
 from worlds.misfit_worlds import make_pair
 from worlds.physics import make_session
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
                                        {'name': 'inner', 'axis': [1, 0, 0]}],
                             'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0})

@@ -32,6 +32,8 @@ from msg_adapters.write import encode_imu, write_session
 from worlds.physics import make_session, write_bag
 from worlds.physics_hand import hold_and_turn
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 G = 9.80665
 
 
