@@ -67,7 +67,7 @@ def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndar
     rate = centred @ inverse.T
     step, first, second, slopes = np.diff(time), rate[:-1], rate[1:], _slope_weights(time)
     vectors = _rotation_vectors(rate, step, slopes)
-    mat_ki = _matrix_to_sensor(_prefix_product(_quaternion(vectors)))
+    mat_ki = Rotation.from_quat(_prefix_product(vectors).T).inv().as_matrix()
     to_last = mat_ki[-1] @ np.swapaxes(mat_ki, 1, 2)
     gain = to_last @ _right_jacobian(vectors)
     weight = _per_sample(gain, step, first, second, slopes)
@@ -82,7 +82,7 @@ def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndar
 def total_rotation(time: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Return `Turn.mat_ji` of true rates, rad/s, shape (n, 3), without the derivatives, which take most of the time."""
     vectors = _rotation_vectors(rate, np.diff(time), _slope_weights(time))
-    return _matrix_to_sensor(_prefix_product(_quaternion(vectors))[:, -1:])[0]
+    return Rotation.from_quat(_prefix_product(vectors)[:, -1]).inv().as_matrix()
 
 
 def _rotation_vectors(rate, step, slopes):
@@ -127,31 +127,19 @@ def _per_sample(gain, step, first, second, slopes):
     return weight
 
 
-def _quaternion(vectors):
-    """Return unit quaternions of rotation vectors, rows w, x, y, z, shape (4, n)."""
-    angle = np.linalg.norm(vectors, axis=1)
-    return np.vstack([np.cos(0.5 * angle), 0.5 * np.sinc(0.5 * angle / np.pi) * vectors.T])
-
-
 def _multiply(left, right):
-    (a, b, c, d), (w, x, y, z) = left, right
-    return np.stack([a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x,
-                     a * z + b * y - c * x + d * w])
+    (b, c, d, a), (x, y, z, w) = left, right
+    return np.stack([a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w,
+                     a * w - b * x - c * y - d * z])
 
 
-def _prefix_product(quaternions):
-    """Return q_0, q_0 q_1, q_0 q_1 q_2, ...: doubling the reach in every pass."""
-    product, reach = quaternions.copy(), 1
+def _prefix_product(vectors):
+    """Return q_0, q_0 q_1, q_0 q_1 q_2, ... of rotation vectors, rows x, y, z, w, shape (4, n): doubling the reach in every pass."""
+    product, reach = np.ascontiguousarray(Rotation.from_rotvec(vectors).as_quat().T), 1
     while reach < product.shape[1]:
         product[:, reach:] = _multiply(product[:, :-reach], product[:, reach:])
         reach *= 2
-    return product / np.linalg.norm(product, axis=0)
-
-
-def _matrix_to_sensor(quaternions):
-    """Return the matrices that transform coordinates from the first sensor frame to the turned one (the transposed attitude)."""
-    cross = skew(quaternions[1:].T)
-    return np.eye(3) - 2 * quaternions[0, :, None, None] * cross + 2 * cross @ cross
+    return product
 
 
 def _right_jacobian(vectors):
