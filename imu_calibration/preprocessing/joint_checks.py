@@ -82,6 +82,9 @@ def _frozen(window, table, expected, *, joint):
         faster = motion.rate.copy()
         faster[:, joint] += 1.0
         axis = reference_motion(table, replace(motion, rate=faster)).rate_s - reference_motion(table, motion).rate_s
+        slope = np.gradient(expected[start:stop], window.time[start:stop], axis=0)
+        lag = (rest * slope).sum() / max((slope**2).sum(), 1e-300)   # a late clock turns the rates of the other joints about this axis too
+        rest = rest - lag * slope
         along, measured = (rest * axis).sum(axis=1), (window.rate_s[start:stop] * axis).sum(axis=1)
         square = float(along @ along)
         if square > len(along) * MIN_TURN_RATE**2 and square > FROZEN_SHARE * (rest**2).sum() and square > OWN**2 * (measured @ measured):

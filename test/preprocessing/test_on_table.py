@@ -163,6 +163,23 @@ def test_a_reversed_joint_is_no_standstill_of_a_parallel_one(gimbals):
     assert finding.check == 'on_table' and 'outer' in finding.text and 'middle' not in finding.text
 
 
+@pytest.mark.parametrize('lag', [0.05, -0.05])
+def test_a_late_clock_is_no_standstill(gimbals, lag):
+    """While outer and inner turn, a lag turns the rate of outer about the axis of middle, which rests; a middle that turns unseen is a standstill."""
+    table, time = gimbals[1], np.arange(1000) * 0.01
+
+    def motion(time, outer, middle=0.0):
+        rate = np.stack([outer * np.sin(time), middle * np.cos(2 * time), np.full(1000, 3.0)], axis=1)
+        position = np.stack([-outer * np.cos(time), middle * np.sin(2 * time) / 2, 3.0 * time], axis=1)
+        return JointMotion(time, position, rate, np.zeros((1000, 3)), np.zeros((1000, 3)))
+
+    def checked(outer, middle):
+        felt = reference_motion(table, motion(time - lag, outer, middle))
+        return standing_still([Window(WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, felt.force_s, felt.rate_s, motion(time, outer))], table)
+    assert checked(1.5, 0.0) is None
+    assert checked(0.0, 0.5).check == 'frozen'
+
+
 @pytest.mark.parametrize(('order', 'signs', 'words'), [([1, 0, 2], [1, 1, -1], "measured x is the reference's y"),
                                                        ([0, 1, 2], [-1, -1, 1], "measured y is minus the reference's y")])
 def test_imu_axes_exchanged_in_a_part_of_the_recording_are_reported_with_the_time(gimbals, order, signs, words):
