@@ -101,7 +101,7 @@ class _Entry:
 
 def profile_names() -> dict[str, str]:
     """Return the names of all profiles with one line of description each, a dict."""
-    return {name: entry.description for name, entry in _REGISTRY.items()}
+    return {name: entry.description for name, entry in _REGISTRY.items() if '_up_' not in name}
 
 
 def make_profile(name: str, seed: int = 0, table: dict[str, Any] | Table | None = None, *, duration: float | None = None) -> Profile:

@@ -8,6 +8,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
+from imu_calibration.simulation.motion_primitives import REGISTRY, avrutov_rates_deg
 from imu_calibration.simulation.profiles import make_profile, profile_names
 
 NAMES = sorted(profile_names())
@@ -109,10 +110,50 @@ def test_other_tables():
         make_profile('no_such_profile')
 
 
+@pytest.mark.parametrize('name', sorted(name for name in REGISTRY if name.startswith('avrutov_') and name[8] in 'XYZ'))
+def test_equal_angles_determine_the_linear_model(name):
+    """All 36 cases of gimbal order and gravity have rank 4, and rank 7 with products (the 41 positions of samples 1 and 2)."""
+    profile = make_profile(name)
+    times = profile.find('rest').mean(axis=1)[-41:]
+    angles = np.degrees(profile.at(times).position)
+    np.testing.assert_allclose(angles, np.arange(0, 401, 10)[:, None] * np.ones(3), atol=1e-9)
+    ref = reference(profile, times)
+    x, y, z = ref.force_s.T / ref.gravity
+    linear = np.stack([np.ones(41), x, y, z], axis=1)
+    assert np.linalg.matrix_rank(linear) == 4
+    assert np.linalg.matrix_rank(np.column_stack([linear, x * y, y * z, x * z]), tol=1e-6) == 7
+
+
+def test_conditions_of_equal_angles_are_those_of_the_analysis():
+    for name, expected in (('avrutov_ZYX', 3.767), ('avrutov_XYX_up_x', 3.596)):
+        profile = make_profile(name)
+        ref = reference(profile, profile.find('rest').mean(axis=1)[-41:])
+        assert np.linalg.cond(np.column_stack([np.ones(41), ref.force_s / ref.gravity])) == pytest.approx(expected, abs=1e-3)
+
+
 def test_the_literal_simultaneous_turn_is_degenerate():
     profile = make_profile('avrutov_111')
     ref = reference(profile, profile.find('rest').mean(axis=1))
     assert np.linalg.matrix_rank(np.column_stack([np.ones(len(ref)), ref.force_s]), tol=1e-9) == 3
+
+
+@pytest.mark.parametrize('sample, condition', [(3, 1131.43), (4, 2.3256e5)])
+def test_gyroscope_series_give_the_rates_of_the_paper(sample, condition):
+    profile = make_profile(f'avrutov_rates_{sample}')
+    spins = profile.find('spin').mean(axis=1)
+    rates = np.degrees(reference(profile, spins, latitude=None, gravity=9.8).rate_s)
+    wanted = avrutov_rates_deg(sample)
+    np.testing.assert_allclose(rates, wanted[-len(rates):], atol=1e-9)
+    x, y, z = wanted.T
+    columns = [np.ones(11), x, y, z] + ([x * y, y * z, x * z] if sample == 4 else [])
+    assert np.linalg.cond(np.column_stack(columns)) == pytest.approx(condition, rel=1e-4)
+
+
+def test_commanded_gimbal_rates_are_not_body_rates():
+    profile = make_profile('avrutov_gimbals_3')
+    start, end = profile.find('spin')[-1]
+    rates = np.degrees(reference(profile, np.linspace(start, end, 3000), latitude=None, gravity=9.8).rate_s)
+    assert np.abs(rates.mean(axis=0) - avrutov_rates_deg(3)[-1]).max() > 4.0
 
 
 def test_skewed_fixture_shares_every_spin_among_the_sensor_axes():
