@@ -16,7 +16,7 @@ from imu_calibration.kinematics.table import Table
 
 def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
                      values: dict[str, np.ndarray] | None = None, roughly: bool = False,
-                     shifts: dict[tuple, list] | None = None) -> Reference:
+                     shifts: dict[tuple, list] | None = None, attitude: bool = True) -> Reference:
     """
     Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
 
@@ -30,6 +30,8 @@ def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: J
         Approximate a lag by a delay of the same first derivative; a filter averages several delays and costs as many times more.
     shifts : dict, optional
         Lags -> (weight, shifted motion) pairs of earlier calls with this motion; new ones are added.
+    attitude : bool
+        As in `reference_motion`.
 
     """
     acting = []
@@ -48,7 +50,7 @@ def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: J
         for _, warp, at in acting:
             if not isinstance(warp, Lag):
                 there, felt = warp(there, felt, at)
-        references.append((weight, reference_motion(there, felt, temperature_c)))
+        references.append((weight, reference_motion(there, felt, temperature_c, attitude=attitude)))
     return mean_reference(references, motion)
 
 
@@ -85,7 +87,7 @@ class References:
         self._shifts: dict[tuple, list] = {}
 
     def at(self, sensor: str, effect: Effect | None = None, values: np.ndarray | None = None, *, roughly: bool = False) -> Reference:
-        """Return the reference of `sensor`, with other values for one effect where given; `roughly` as in `warped_reference`."""
+        """Return the reference of `sensor`; with other values for one effect, without attitude; `roughly` as in `warped_reference`."""
         acting = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and np.any(self.model.point_of(e)))
         change, moved = None, ()
         if effect is not None and values is not None:
@@ -94,7 +96,7 @@ class References:
         key = (roughly, acting, *moved)
         if key not in self._known:
             self._known[key] = warped_reference(self.model, sensor, self.table, motion=self.motion, temperature_c=self.temperature_c,
-                                                values=change, roughly=roughly, shifts=self._shifts)
+                                                values=change, roughly=roughly, shifts=self._shifts, attitude=not moved)
         return self._known[key]
 
 

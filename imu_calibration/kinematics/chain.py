@@ -167,7 +167,7 @@ class _Step(NamedTuple):
     """Directions u, v of a lean in these coordinates, shape (2, 3)."""
 
 
-def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarray | None = None) -> Reference:
+def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarray | None = None, *, attitude: bool = True) -> Reference:
     """
     Return the readings of a perfect sensor at the reference point of the mount.
 
@@ -190,6 +190,8 @@ def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarra
         Joints at the instants wanted, columns in the order of ``table.joint_names``.
     temperature_c : array, shape (n,), optional
         Passed on.
+    attitude : bool
+        Whether the attitude is wanted, a third of the time; without it `mat_sn` is NaN.
 
     Returns
     -------
@@ -197,15 +199,17 @@ def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarra
 
     """
     n_samples = len(motion.time)
-    mat_sn, force_s = np.empty((n_samples, 3, 3)), np.empty((n_samples, 3))
-    rate_s, alpha_s = np.empty((n_samples, 3)), np.empty((n_samples, 3))
+    mat_sn = np.empty((n_samples, 3, 3)) if attitude else np.broadcast_to(np.nan, (n_samples, 3, 3))
+    force_s, rate_s, alpha_s = np.empty((n_samples, 3)), np.empty((n_samples, 3)), np.empty((n_samples, 3))
     constants = _constants(table)
     steps = _chain_steps(constants, motion)
+    base = constants.base[:, 0 if attitude else 2 if any(link.sag for link in constants.links) else 3:]
     for start in range(0, n_samples, _CHAIN_BLOCK_SAMPLES):
         part = slice(start, min(start + _CHAIN_BLOCK_SAMPLES, n_samples))
-        columns = _run_chain(constants.base, motion, steps, part)
-        mat_sn[part] = columns[:, :3].transpose(2, 0, 1)
-        rate_s[part], alpha_s[part], force_s[part] = columns[:, 3].T, columns[:, 4].T, columns[:, 5].T
+        columns = _run_chain(base, motion, steps, part)
+        if attitude:
+            mat_sn[part] = columns[:, :3].transpose(2, 0, 1)
+        rate_s[part], alpha_s[part], force_s[part] = columns[:, -3].T, columns[:, -2].T, columns[:, -1].T
     return Reference(time=motion.time, mat_sn=mat_sn, force_s=force_s, rate_s=rate_s, alpha_s=alpha_s, gravity=constants.gravity,
                      temperature_c=temperature_c, branch=motion.thermal_branch, shaking=motion.vibration, motion=motion)
 
@@ -281,16 +285,16 @@ def _base_columns(table):
 
 
 def _run_chain(columns, motion, steps, part):
-    """Return the columns of `_base_columns` at the sensor, in its frame, shape (3, 6, n)."""
+    """Return the columns of `_base_columns`, all or the last ones, at the sensor, in its frame, shape (3, k, n)."""
     for step in steps:
         if step.offset.any():
             columns = columns.copy()
-            columns[:, 5] += _arm_force(columns[:, 3], columns[:, 4], step.offset[:, None])
+            columns[:, -1] += _arm_force(columns[:, -3], columns[:, -2], step.offset[:, None])
         if not np.array_equal(step.matrix, np.eye(3)):
             columns = np.tensordot(step.matrix, columns, 1)
         if step.link is not None:
             columns = _move(columns, step, motion, part)
-    return np.broadcast_to(columns, (3, 6, part.stop - part.start))
+    return np.broadcast_to(columns, (*columns.shape[:2], part.stop - part.start))
 
 
 def _move(columns, step, motion, part):
@@ -314,7 +318,7 @@ def _lean(columns, step, angle, rate, acceleration):
         lean = wobble_at(link.wobble, angle, rate, acceleration=acceleration)
         vector += np.einsum('dn,k->dkn', lean.real, step.across[0]) + np.einsum('dn,k->dkn', lean.imag, step.across[1])
     if link.sag:
-        up, spin, alpha = columns[:, 2], columns[:, 3], columns[:, 4]
+        up, spin, alpha = columns[:, -4], columns[:, -3], columns[:, -2]
         moves = _cross(up, spin)   # up is fixed in space; the rotation of the Earth is negligible relative to the sag
         axis = np.zeros((3, 1))
         axis[step.third] = step.sense * link.sag
@@ -338,8 +342,8 @@ def _cross(first, second):
 def _slide(columns, axis, position, rate, acceleration):
     """Bring `columns` into the link that slides along `axis`, shape (3, 1)."""
     slid = np.array(np.broadcast_to(columns, columns.shape[:2] + (len(position),)))
-    spin, alpha = slid[:, 3], slid[:, 4]
-    slid[:, 5] += _arm_force(spin, alpha, axis * position) + 2 * rate * _cross(spin, axis) + axis * acceleration
+    spin, alpha = slid[:, -3], slid[:, -2]
+    slid[:, -1] += _arm_force(spin, alpha, axis * position) + 2 * rate * _cross(spin, axis) + axis * acceleration
     return slid
 
 
@@ -353,8 +357,8 @@ def _turn(columns, third, angle, rate, acceleration):
     turned[second] = cos * columns[second]
     turned[second] -= sin * columns[first]
     turned[third] = columns[third]
-    turned[first, 4] += turned[second, 3] * rate
-    turned[second, 4] -= turned[first, 3] * rate
-    turned[third, 3] += rate
-    turned[third, 4] += acceleration
+    turned[first, -2] += turned[second, -3] * rate
+    turned[second, -2] -= turned[first, -3] * rate
+    turned[third, -3] += rate
+    turned[third, -2] += acceleration
     return turned

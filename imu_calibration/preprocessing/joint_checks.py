@@ -47,7 +47,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     windows = [window for window in windows if len(window) > 2 and len(window.motion) == len(window)]
     if not windows:
         return None
-    expected = [reference_motion(table, window.motion).rate_s for window in windows]
+    expected = [reference_motion(table, window.motion, attitude=False).rate_s for window in windows]
     turning = [np.linalg.norm(rate, axis=1) > MIN_TURN_RATE for rate in expected]
     repeats = [np.diff(window.rate_s, axis=0) == 0 for window in windows]
     same = [np.append(each.all(axis=1), False) for each in repeats]
