@@ -33,9 +33,9 @@ endif
 
 STAMP = $(VENV)/.installed-$(notdir $(basename $(PINS)))
 PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
-# Three processes on two cores: live tests mostly wait. conftest.py orders the files. test/run_lanes.py repeats live tests that failed.
+# Four processes on two cores: live tests mostly wait. conftest.py orders the files. test/run_lanes.py repeats live tests that failed.
 LANES = $(PY) test/run_lanes.py
-PROCESSES = $(PLUGINS) -n 3
+PROCESSES = $(PLUGINS) -n 4
 
 .PHONY: help setup demo live-demo test test-long test-all test-fast mutants lint lint-tools lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
 

@@ -167,7 +167,7 @@ def test_poses_by_hand_through_the_node(tmp_path):
     """The same with a made-up recording."""
     imu, _, _ = simulate(1)
     write_session(tmp_path / 'bag', imu)
-    check_by_hand(tmp_path / 'bag', tmp_path, rate=4.0, gravity=GRAVITY)
+    check_by_hand(tmp_path / 'bag', tmp_path, rate=8.0, gravity=GRAVITY)
 
 
 def check_by_hand(bag, folder, rate, gravity=None):

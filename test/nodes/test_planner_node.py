@@ -258,11 +258,18 @@ class Loop(Station):
         return next(pair.value for pair in self.status['planner_node: drive'].values if pair.key == key)
 
 
+def write_tolerances(path, factor):
+    """Write the usual tolerances times a factor, and return the path."""
+    tolerances = yaml.safe_load((ROOT / 'config' / 'tolerances.yaml').read_text())
+    path.write_text(yaml.safe_dump({sensor: {name: factor * value for name, value in each.items()} for sensor, each in tolerances.items()}))
+    return path
+
+
 @pytest.mark.live
 @pytest.mark.long
 def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_path):
     with Loop(tmp_path / 'out.txt') as loop:
-        loop.begin(tmp_path)
+        loop.begin(tmp_path, {'tolerances_file': write_tolerances(tmp_path / 'tolerances.yaml', 2.0)})
         loop.spin_for(2.0)
         assert loop.value('state') == 'idle' and loop.value('motion') == '0'   # nothing moves before start
         loop.ask('next')
@@ -328,9 +335,7 @@ def test_a_class_that_the_six_faces_leave_is_driven_apart_and_a_node_that_ends_l
     from imu_calibration.nodes.inputs import latched_qos
     with Loop(tmp_path / 'out.txt') as loop:
         # Tolerances that the six faces reach: the diagnosis follows at once, and no motion for a parameter separates the class before.
-        tolerances = yaml.safe_load((ROOT / 'config' / 'tolerances.yaml').read_text())
-        wide = tmp_path / 'wide.yaml'
-        wide.write_text(yaml.safe_dump({sensor: {name: 1e4 * value for name, value in each.items()} for sensor, each in tolerances.items()}))
+        wide = write_tolerances(tmp_path / 'wide.yaml', 1e4)
         arms = {'accelerometer_model': 'bias+matrix+accel_size_effect'}
         loop.begin(tmp_path, {'stall_patience': 30.0, 'silence': 10.0, 'first_speed': 0.1, 'imu_rate': 100.0, 'tolerances_file': wide, **arms},
                    arms | {'model_as_asked': True, 'diagnosis_period': 600.0}, profile='six_faces', hide='soft_spring', hide_size=1.8, seed=1, time_factor=8.0, imu_rate=100.0,
