@@ -142,6 +142,7 @@ def models(*names):
     return {f'{sensor}_model': '+'.join([base, *(name for name in names if SENSOR[name] == sensor)]) for sensor, base in ASKED.items()}
 
 
+@pytest.mark.long
 def test_they_are_simulated_calibrated_and_reported():
     made = session(*ADDED)
     found = imu.calibrate(made.samples, made.table, catalogue=MINE, model_as_asked=True, **models(*ADDED))

@@ -103,6 +103,7 @@ def test_solving_on_the_way_changes_nothing(session, expected):
     assert_same(live.solve(pending=True), expected)
 
 
+@pytest.mark.long
 @pytest.mark.real_data
 def test_a_real_recording_live(recordings):
     imu = load(recordings, 'mpu9150_0')

@@ -100,6 +100,7 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
         assert found['accelerometer'].rms == pytest.approx(20 * MG / np.sqrt(6), rel=0.1)   # a mean over three axes, as of other residuals
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures('few_candidates')
 def test_calibrate_reports_the_same_unexplained_residuals_as_diagnose():
     """Tones and the scatter of one axis were tested by `diagnose` only."""
