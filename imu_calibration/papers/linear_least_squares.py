@@ -1,4 +1,4 @@
-"""Linear least squares that stays accurate: orthogonal factors of scaled columns, never the normal equations."""
+"""Accurate linear least squares: orthogonal factors of scaled columns instead of normal equations."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ import scipy.linalg
 from imu_calibration.core.errors import InputError, NotObservableError
 
 RANK_TOLERANCE = 1e-10
-"""A singular value of the unit-column design below this times the largest counts as zero; rounding leaves about 1e-15."""
+"""A singular value of the unit-column design below this times the largest counts as zero; rounding errors are about 1e-15."""
 COLUMN_TOLERANCE = 1e-14
 """A column shorter than this times the longest is rounding of zero (the sine of pi), not a column to be scaled up."""
 
@@ -93,7 +93,7 @@ def condition_numbers(design: np.ndarray) -> tuple[float, float]:
 
 def null_directions(design: np.ndarray, param_names: tuple[str, ...]) -> list[dict[str, float]]:
     """
-    Return the combinations of parameters that leave every output unchanged, as a list of {name: weight}.
+    Return the combinations of parameters that change no output, as a list of {name: weight}.
 
     Weights are changes of the parameters in their own units, the leading one being 1; combinations are made as short as an echelon
     form can. A column of zeros gives a direction of its own.
@@ -129,7 +129,7 @@ def predicted_sd(design: np.ndarray, weights: np.ndarray | None = None, sigma: f
 
 @dataclass(frozen=True, eq=False)
 class ToleranceScaled:
-    """What the data say about directions of the parameter space when each parameter is measured in its tolerance."""
+    """Standard deviations along directions of the parameter space, each parameter in units of its tolerance."""
 
     singular_values: np.ndarray
     """One over the sd of each direction in tolerances, descending, shape (n_params,); below 1 the direction is too weak."""

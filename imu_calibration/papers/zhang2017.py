@@ -63,7 +63,7 @@ class StaticModel:
 
 
 def printed_static_model() -> StaticModel:
-    """Return Table 1 as it stands; its second row is no unit vector."""
+    """Return Table 1 as printed; its second row is no unit vector."""
     return StaticModel(TABLE_1_SCALE, np.cos(np.deg2rad(TABLE_1_ANGLES_DEG)), TABLE_1_BIAS)
 
 
@@ -117,9 +117,9 @@ def closed_form(means_static: np.ndarray, means_spin: np.ndarray, rate: float, *
     directions : array, shape (3, 3)
         Direction cosines, row i; a full sensor matrix does as well when the means are raw.
     spin_axes : array, shape (3, 3), optional
-        Spin axes in the body frame, one per row; the body axes if not given. Arms come back in the body frame.
+        Spin axes in the body frame, one per row; the body axes if not given. The arms are in the body frame.
     as_printed : bool
-        Use the printed fourth term of r_jx (spin instead of static reading), to see what it does.
+        Use the printed fourth term of r_jx (spin instead of static reading), to show its effect.
 
     Raises
     ------
@@ -173,7 +173,7 @@ class AxisReading:
     sensor: str
     """Sensor whose reading this is, 'x', 'y' or 'z'."""
     theoretical_g: float
-    """What a perfect sensor reads, g."""
+    """Reading of a perfect sensor, g."""
     before_g: float
     """Reading before compensation, g."""
     after_g: float
@@ -194,7 +194,7 @@ def axis_readings(measured: np.ndarray, compensated: np.ndarray, reference: np.n
     Parameters
     ----------
     measured, compensated, reference : arrays, shape (n, 3)
-        Window means of specific force: raw, corrected, and what a perfect sensor at the reference point would read, m/s^2.
+        Window means of specific force: raw, corrected, and of a perfect sensor at the reference point, m/s^2.
     rate : array, shape (n,)
         Turn rate of the table in each window, rad/s.
     gravity : float
@@ -252,7 +252,7 @@ def static_navigation(model: StaticModel, drift_sd_g: float, rng: np.random.Gene
     model : StaticModel
         True sensor, V/g.
     drift_sd_g : float
-        Bias drawn anew for every run (six positions and the navigation), g.
+        Sd of the bias, which is drawn for every run (six positions and the navigation), g.
     rng : numpy.random.Generator
     n_draws : int
     seconds, noise_sd_g, sample_rate, calibration_seconds : float

@@ -20,7 +20,7 @@ class Run:
     """True motion during one run; a run whose reading is constant is one row, the mean."""
 
     name: str
-    """What the table does."""
+    """Motion of the table."""
     force: np.ndarray
     """Specific force at the reference point, m/s^2, shape (n, 3)."""
     rate: np.ndarray
@@ -99,7 +99,7 @@ def skewed_axes(skew_deg: float) -> np.ndarray:
 
 
 def average_headings(tilt: float, up: np.ndarray, noise_sd: float, *, n_headings: int = 4) -> Run:
-    """Return the mean of a tilted position over equally spaced headings: what takes levelling out of the static reference."""
+    """Return the mean of a tilted position over equally spaced headings, in which the error of levelling cancels."""
     parts = [face(up, noise_sd, tilt, azimuth=2 * np.pi * k / n_headings) for k in range(n_headings)]
     return replace(parts[0], force=np.mean([part.force for part in parts], axis=0))
 
@@ -125,6 +125,7 @@ def _square_to(axis):
 PARAM_NAMES = ('bias', 'm_x', 'm_y', 'm_z', 'r_x', 'r_y', 'r_z')
 """Parameters of one accelerometer: m/s^2, 1, m."""
 MAX_JOINT_FIT_STEPS = 30
+"""Gauss-Newton steps, at most."""
 TOLERANCES = np.array([1e-4 * STANDARD_GRAVITY, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
 """0.1 mg, 0.1 mg/g, 0.1 mm."""
 
@@ -145,7 +146,7 @@ def jacobian(runs: Sequence[Run], values: np.ndarray) -> np.ndarray:
 def judge_design(runs: Sequence[Run], matrix: np.ndarray, arms: np.ndarray, *,
                  tolerances: np.ndarray = TOLERANCES) -> list[ToleranceScaled]:
     """
-    Predict what a design can determine, one `ToleranceScaled` per accelerometer: sd over tolerance and weak directions.
+    Predict the precision of a design, one `ToleranceScaled` per accelerometer: sd over tolerance and weak directions.
 
     An sd over tolerance above 1 means that the parameter must not be reported as a plain value.
 

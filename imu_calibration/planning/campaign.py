@@ -189,7 +189,7 @@ class Decision:
 
 class Campaign:
     """
-    Goes from motion to motion.
+    A sequence of motions, each chosen after the one before.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ class Campaign:
 
     def decide(self, position: np.ndarray, elapsed: float) -> Decision:
         """
-        Return what to do next.
+        Return the next decision.
 
         Parameters
         ----------
