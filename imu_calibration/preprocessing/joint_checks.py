@@ -81,7 +81,8 @@ def _frozen(window, table, expected, *, joint):
         motion, rest = window.motion.select(slice(start, stop)), (window.rate_s - expected)[start:stop]
         faster = motion.rate.copy()
         faster[:, joint] += 1.0
-        axis = reference_motion(table, replace(motion, rate=faster)).rate_s - reference_motion(table, motion).rate_s
+        plain, changed = (reference_motion(table, each, attitude=False).rate_s for each in (motion, replace(motion, rate=faster)))
+        axis = changed - plain
         slope = np.gradient(expected[start:stop], window.time[start:stop], axis=0)
         lag = (rest * slope).sum() / max((slope**2).sum(), 1e-300)   # a late clock turns the rates of the other joints about this axis too
         rest = rest - lag * slope

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import BPoly, PPoly
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import setting
@@ -56,6 +55,7 @@ class JointTrajectory:
     @cached_property
     def _curve(self):
         """The polynomials (PPoly), each by the quantities that are given at both of its ends."""
+        from scipy.interpolate import BPoly, PPoly  # here, because its import is slow
         given = [values for values in (self.position, self.rate, self.acceleration) if values is not None]
         return PPoly.from_bernstein_basis(BPoly.from_derivatives(self.time, np.stack(given, axis=1)))
 
