@@ -170,9 +170,8 @@ def _clipped(found):
 
 
 def _examined(found):
-    """Return a search whose unexplained residual is known, with its blocks freed: the solutions need that memory."""
-    assert found.unexplained is not None   # cached
-    found.free()
+    """Return a search whose unexplained residual is evaluated and whose blocks are freed."""
+    found.released()
     return found
 
 
@@ -181,7 +180,7 @@ def _changes(searches, added):
     found, model = searches[0], searches[0].attempt.baseline
     clipping = (model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name for limit in found.limits)
     rests = {sensor: {'rms': rest.rms, 'axes': list(rest.axes)} for each in reversed(searches)
-             for sensor, rest in _examined(each).unexplained.items() if rest.significant}
+             for sensor, rest in each.released().items() if rest.significant}
     return ModelChanges((*clipping, *(name for _, name in added)), tuple(question.name for question in found.denied), _strange(searches),
                         unexplained=rests)
 

@@ -203,7 +203,9 @@ def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarra
     force_s, rate_s, alpha_s = np.empty((n_samples, 3)), np.empty((n_samples, 3)), np.empty((n_samples, 3))
     constants = _constants(table)
     steps = _chain_steps(constants, motion)
-    base = constants.base[:, 0 if attitude else 2 if any(link.sag for link in constants.links) else 3:]
+    # The last columns are up, which a sag needs, the rate, the angular acceleration and the force.
+    needed = 6 if attitude else 3 + any(link.sag for link in constants.links)
+    base = constants.base[:, -needed:]
     for start in range(0, n_samples, _CHAIN_BLOCK_SAMPLES):
         part = slice(start, min(start + _CHAIN_BLOCK_SAMPLES, n_samples))
         columns = _run_chain(base, motion, steps, part)

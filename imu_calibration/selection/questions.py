@@ -68,7 +68,7 @@ def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]
     span = _temperature_span(windows)
     have = {e.key for e in model.effects}
     branches = [float(window.motion.thermal_branch.mean()) for window in windows if window.motion.thermal_branch is not None]
-    turned, shaken = (max(branches) - min(branches) if branches else 0.0) >= BRANCHES_APART, _vibrates(windows)
+    turned, shaken = bool(branches) and max(branches) - min(branches) >= BRANCHES_APART, _vibrates(windows)
     return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds, span) or _not_turned(effect, turned)
                         or _not_shaken(effect, shaken))
 
@@ -134,7 +134,7 @@ def _why_not(effect, have, table, kinds, span):
 
 
 def time_constants(duration: float, number: int = N_TIME_CONSTANTS) -> np.ndarray:
-    """Return time constants of warm-ups that a recording of `duration` s determines, s, shape (number,); default those of the bank."""
+    """Return time constants of warm-ups that a recording of `duration` s determines, s, shape (number,); default the ones of the bank."""
     return np.geomspace(max(duration / 30, 5.0), 2.0 * duration, number)
 
 

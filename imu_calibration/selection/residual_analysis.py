@@ -108,10 +108,12 @@ class Examination(Investigation):
         sizes = proposal.sizes if proposal is not None else [regime.size * np.sqrt(regime.inside.mean()) for regime in first.values()]
         return replace(found, significant=True, rms=float(np.hypot.reduce(sizes)))
 
-    def free(self) -> None:
-        """Free the blocks and their fits; they are computed again on demand."""
+    def released(self) -> dict[str, Unexplained]:
+        """Return `unexplained` and free the blocks and their fits, which are computed again on demand: solutions need that memory."""
+        found = self.unexplained
         self.__dict__.pop('blocks', None)
         self._fits.clear()
+        return found
 
     def without(self, gone: Sequence[Question]) -> 'Examination':
         """Return the Examination without some findings; they remain doubtful, and widen the uncertainty of all other ones."""
