@@ -179,8 +179,7 @@ def _changes(searches, added):
     """Return the changes of the requested model by searches (the first has priority) and their effects."""
     found, model = searches[0], searches[0].attempt.baseline
     clipping = (model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name for limit in found.limits)
-    rests = {sensor: {'rms': rest.rms, 'axes': list(rest.axes)} for each in reversed(searches)
-             for sensor, rest in each.released().items() if rest.significant}
+    rests = {sensor: rest.entry for each in reversed(searches) for sensor, rest in each.released().items() if rest.significant}
     return ModelChanges((*clipping, *(name for _, name in added)), tuple(question.name for question in found.denied), _strange(searches),
                         unexplained=rests)
 

@@ -54,7 +54,8 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
         found = replace(found, named=[q for q in found.named if q not in faint], denied=[*found.denied, *faint])
     added = tuple(q.name for q in found.adopted if q.name not in asked[q.sensor])
     changes = ModelChanges(added, tuple(question.name for question in found.denied),
-                           {question.name: found.inquiry.explained.share(found.named, question) for question in found.implausible})
+                           {question.name: found.inquiry.explained.share(found.named, question) for question in found.implausible},
+                           unexplained={sensor: rest.entry for sensor, rest in found.unexplained.items() if rest.significant})
     return EvidentHand(hand, found, changes)
 
 

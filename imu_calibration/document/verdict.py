@@ -87,10 +87,14 @@ def _adopted(calibration):
 
 def _unexplained(calibration):
     """Return notes on the unexplained residuals of the search, by the test of diagnoses."""
-    return [Reason(NOTE, f'{error_text(rest["rms"], UNITS[sensor], 2)} rms of the {sensor} residual are unexplained '
-                         f'({", ".join(rest["axes"])})',
+    return [Reason(NOTE, unexplained_text(sensor, rest['rms'], rest.get('unit')) + f' ({", ".join(rest["axes"])})' * bool(rest['axes']),
                    'find the cause', key='diagnose', sensors=(sensor,))
             for sensor, rest in (calibration.statistics.get('unexplained') or {}).items()]
+
+
+def unexplained_text(sensor: str, rms: float, unit: str | None = None) -> str:
+    """Return the statement of an unexplained residual; `unit` where it is not the sensor's."""
+    return f'{error_text(rms, unit or UNITS[sensor], 2)} rms of the {sensor} residual are unexplained'
 
 
 def _strange(values):

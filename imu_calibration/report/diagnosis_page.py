@@ -8,7 +8,7 @@ from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Fi
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult, beyond_lines
 from imu_calibration.core.units import for_people
 from imu_calibration.document.decision import DECISION, PARAMETERS
-from imu_calibration.document.verdict import judge
+from imu_calibration.document.verdict import judge, unexplained_text
 from imu_calibration.effects.base import AXES, SENSORS, UNITS
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, Drawn, draw, draw_tones
 from imu_calibration.report.overlay import overlay_section, variables
@@ -71,13 +71,13 @@ def _reasons(diagnosis, rests):
     if not lines and not rests:
         lines = [(f'None of the {len(diagnosis.candidates)} effects under test explains more than noise.', '')]
     for sensor, rest in rests:
-        rms = in_unit(rest.rms, rest.unit or UNITS[sensor])
         if rest.proposal is not None:
+            rms = in_unit(rest.rms, rest.unit or UNITS[sensor])
             lines.append((f'{rms} rms of the {sensor} residual match no effect of the catalogue; they follow '
                           f'{" and ".join(rest.proposal.columns)}.', f'to confirm the formula: {rest.proposal.motion}'))
             continue
         more = f', correlated with {rest.correlates_with}' if rest.correlates_with else ''
-        lines.append((f'{rms} rms of the {sensor} residual are unexplained{more}' + '.',
+        lines.append((f'{unexplained_text(sensor, rest.rms, rest.unit)}{more}.',
                       'check the mount and the joints for a knock or slip, and causes outside the catalogue'))
     return lines
 

@@ -60,6 +60,11 @@ class Unexplained:
     tones: tuple = ()
     """Fixed frequencies and fixed multiples of a joint's speed in it (`Tone`), the surest first."""
 
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Entry of a calibration document."""
+        return {'rms': self.rms, 'axes': list(self.axes)} | ({'unit': self.unit} if self.unit else {})
+
 
 def unexplained(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Question]) -> dict[str, Unexplained]:
     """Return sensor -> Unexplained for a choice of effects."""

@@ -9,15 +9,15 @@ import pytest
 from numpy.testing import assert_allclose
 from refusal import refused
 
-from imu_calibration.calibration.diagnosis import hand_diagnosis
 from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
 from imu_calibration.calibration.diagnosis.hand_diagnosis import told_by_hand
-from imu_calibration.calibration.hand_by_evidence import extended_by_hand
+from imu_calibration.calibration.hand_by_evidence import extended_by_hand, solve_by_evidence
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.gravity import pose_residuals
 from imu_calibration.references.gravity.effect_rows import build_rows
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions
@@ -91,6 +91,9 @@ def test_the_attitudes_at_which_a_rest_appears_are_told():
     regime = rest.regimes[0]
     assert regime.axis == 'y' and regime.variable == 'specific force along y' and -4.5 < regime.bounds[0] < -1.5 and 1.5 < regime.bounds[1] < 4.5
     assert any(regime.variable in line and 'gyroscope y' in line for line in diagnosis_lines(diagnosis))
+    imu, ranges, _ = simulate(21500, n_poses=24, spoil=spoil)   # calibrate and diagnose use one test of the unexplained residual
+    assert solve_by_evidence(gather_by_hand(imu, ranges), HandOptions(GRAVITY)).changes.unexplained == {'gyroscope': rest.entry}
+    assert rest.entry['rms'] == rest.rms > 0 and rest.entry['axes'] == ['y']
     everywhere = diagnosed(21500, stops).diagnosis.unexplained['accelerometer']
     assert everywhere.significant and not everywhere.regimes
 
@@ -123,7 +126,7 @@ def test_a_place_among_few_poses_is_paid_for(monkeypatch):
         up = rng.normal(size=(24, 3))
         hand = SimpleNamespace(gravity=GRAVITY, state=SimpleNamespace(up=up / np.linalg.norm(up, axis=1, keepdims=True)), poses=poses)
         block = SimpleNamespace(sensor='gyroscope', floor=np.ones((24, 3)), pose=np.arange(24), time=poses.time)
-        told += hand_diagnosis.regimes_by_hand(hand, block, rng.normal(size=(24, 3)))
+        told += pose_residuals.regimes_by_hand(hand, block, rng.normal(size=(24, 3)))
     assert len(told) <= 2
 
 

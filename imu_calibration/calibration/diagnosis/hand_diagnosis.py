@@ -1,9 +1,6 @@
-"""Diagnosis of a calibration by hand: the search on poses and turns, the residuals of the poses, and the places of other offsets."""
+"""Diagnosis of a calibration by hand: the findings of a search on poses and turns, with their gains and traces."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -11,62 +8,8 @@ from imu_calibration.calibration.diagnosis.applied_gain import gain_by_hand
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
 from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of
 from imu_calibration.calibration.diagnosis.traces import Traces
-from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.references.gravity.effect_rows import Block
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.model_selection import HandInvestigation
-from imu_calibration.selection.questions import Question
-from imu_calibration.selection.regime_variables import Variable, ranged
-from imu_calibration.selection.regimes import REGIME_LEVEL, AxisResidual, RegimeSearch, RestRegime, exchanges
-from imu_calibration.selection.residual_fit import largest_axes
-from imu_calibration.selection.unexplained import MIN_EXPLAINED_WINDOWS, SIGNIFICANT_SDS, Unexplained, correlate, slow_explanations
-
-NORM = 'norm'
-"""Without a table only the component of the accelerometer's error along gravity is observable."""
-
-
-def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -> tuple[RestRegime, ...]:
-    """
-    Return the clearest regime of each axis.
-
-    Regimes of larger scatter are not reported, since every other range of few poses has it.
-
-    Parameters
-    ----------
-    hand : HandCalibration
-        Of the baseline.
-    block : Block
-        The sensor's rows in poses.
-    residual : ndarray, shape (k, n_axes)
-        Residual of each pose, by a fit without it.
-
-    """
-    names = AXES if residual.shape[1] == len(AXES) else (NORM,)
-    poses = np.arange(len(residual))
-    exchange = exchanges(poses, np.zeros(len(poses)), np.zeros(len(poses)))
-    search, found = RegimeSearch(block.sensor, block.time, _variables(hand, block), exchange=exchange), []
-    for axis, name in enumerate(names):
-        sd = np.sqrt(block.floor[:, axis])
-        rest = AxisResidual(np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None], np.zeros(1), np.zeros(1))
-        found += search.offsets(name, rest, partial(np.multiply, 1.0 / sd[:, None]), level=REGIME_LEVEL / len(names))[:1]
-    return tuple(found)
-
-
-def _variables(hand: HandCalibration, block: Block) -> list[Variable]:
-    """Return the variables of regimes of poses: the attitude, the previous attitude, the time and the temperature."""
-    force = hand.gravity * hand.state.up
-    before = np.concatenate([force[:1], force[:-1]])
-    of = partial(ranged, starts=np.arange(len(block.time)))
-    found = of('time', block.time, 's')
-    for k, axis in enumerate(AXES):
-        found += of(f'specific force along {axis}', force[block.pose, k], 'm/s^2', least=0.5)
-        found += of(f'specific force along {axis} in the pose before', before[block.pose, k], 'm/s^2', least=0.5)
-    warm = hand.poses.temperature_c
-    return found if warm is None else found + of('temperature', warm[block.pose], 'C', least=0.5)
-
-
-TURN_RESIDUAL_UNIT = 'rad/turn'
-"""Unit of the residual of turns: the angle between predicted and measured gravity after a turn."""
 
 
 def _with_residuals(hand):
@@ -92,48 +35,6 @@ def traces_of(baseline: HandCalibration, hand: HandCalibration) -> Traces:
                   errors[1], (poses.stop - poses.start).astype(float), None)
 
 
-def rest_of(hand: HandCalibration, inquiry: Any, named: Sequence[Question], *, sensor: str) -> Unexplained:
-    """Return the unexplained residual of one sensor: its rows at rest and its turns against the expectation from noise."""
-    used = list(inquiry.search.used(named))
-    residuals, sigma, rms, chosen = inquiry.evidence.residuals(used), -np.inf, 0.0, None
-    for block, residual in zip(inquiry.blocks, residuals):
-        if block.sensor != sensor:
-            continue
-        spare = residual.size - np.linalg.matrix_rank(block.rows[:, :, used].reshape(residual.size, -1))
-        if spare < 3:
-            continue
-        own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
-        if block.name == 'poses' or own > max(sigma, SIGNIFICANT_SDS):
-            size = 1.0 if block.duration is None else block.duration[:, None]**2   # the residual of a turn is an angle, of a pose a rate
-            excess = np.sum(residual**2 * size) / spare - np.mean(block.floor * size)
-            if own > sigma:
-                sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block
-    count = len(hand.poses.start)
-    first = next(k for k, block in enumerate(inquiry.blocks) if block.sensor == sensor)
-    layers, noise_sd = residuals[first], np.sqrt(inquiry.blocks[first].floor)
-    significant = bool(sigma > SIGNIFICANT_SDS and count >= MIN_EXPLAINED_WINDOWS)
-    unit = None if chosen is None or chosen.duration is None else TURN_RESIDUAL_UNIT
-    if not significant:
-        return Unexplained(False, rms, float(max(sigma, -99.0)), None, 0.0, layers, noise_sd, unit)
-    name, share = correlate(_explanations(hand), layers / noise_sd)
-    if chosen is not None and chosen.name == 'turns' and name is None:
-        name = 'motion (turns between poses)'
-    heldout = inquiry.evidence.heldout_residuals(used)[first]
-    excess = ((heldout / noise_sd)**2 - 1.0).sum(axis=0)
-    axes = largest_axes(excess) if len(excess) == len(AXES) and excess.max() > 0 else ()
-    return Unexplained(True, rms, float(sigma), name, share, layers, noise_sd, unit,
-                       axes, regimes_by_hand(hand, inquiry.blocks[first], heldout))
-
-
-def _explanations(hand):
-    poses, up = hand.poses, hand.state.up
-    every = np.ones(len(up), bool)
-    yield from slow_explanations(poses.time, np.full(len(up), np.nan) if poses.temperature_c is None else poses.temperature_c)
-    yield 'direction of gravity', up, every
-    yield 'direction of gravity', np.stack([up[:, 0]**2 - up[:, 1]**2, up[:, 2]**2, up[:, 0] * up[:, 1], up[:, 1] * up[:, 2],
-                                            up[:, 0] * up[:, 2]], axis=1), every
-
-
 def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
     """Return the result of an investigation as a Diagnosis; `hand` is a calibration with all findings."""
     inquiry, named = found.inquiry, list(found.named)
@@ -146,6 +47,5 @@ def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
                              motion_of=motions_of) for place in range(len(named)))
     gain = gain_by_hand(found, [], after=named, sensor=named[0].sensor) if named else None
     count = len(found.baseline.poses.start)
-    return Diagnosis(findings, {s: rest_of(found.baseline, inquiry, named, sensor=s) for s in SENSORS},
-                     candidates_of(inquiry.search, named),
+    return Diagnosis(findings, found.unexplained, candidates_of(inquiry.search, named),
                      tuple(found.not_testable), before, after, gain, count, count if named else 0, traces_of(found.baseline, hand))

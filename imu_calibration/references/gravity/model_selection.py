@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -16,11 +17,13 @@ from imu_calibration.references.gravity.hand_calibration import HandCalibration,
 from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.references.gravity.hand_parameters import HandModel, possible_by_hand
 from imu_calibration.references.gravity.pose_evidence import HandEvidence
+from imu_calibration.references.gravity.pose_residuals import unexplained_by_hand
 from imu_calibration.selection.evidence import agree
 from imu_calibration.selection.explained_share import Explained, pruned
 from imu_calibration.selection.gain import OF_MODEL, Gain, gain_of
 from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
 from imu_calibration.selection.search import Named, Search
+from imu_calibration.selection.unexplained import Unexplained
 
 OUTER = 12
 """Number of repetitions of the search without some of the poses, to measure the gain on them."""
@@ -116,6 +119,12 @@ class HandInvestigation(Named):
     def search(self) -> Search:
         """Search of the findings."""
         return self.inquiry.search
+
+    @cached_property
+    def unexplained(self) -> dict[str, Unexplained]:
+        """Sensor -> the residual that no finding explains."""
+        blocks, evidence, used = self.inquiry.blocks, self.inquiry.evidence, self.search.used(self.named)
+        return {sensor: unexplained_by_hand(self.baseline, blocks, evidence, used, sensor=sensor) for sensor in SENSORS}
 
     def point(self, inquiry: Inquiry, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
         """Return effect -> initial values for its columns, of the warm-ups among the chosen effects, from the rows of `inquiry`."""
