@@ -23,6 +23,11 @@ MIN_REPLACEMENT_NATS = 0.01
 """Least fall of the held-out cost for which an effect is replaced, nats: two lags are a delay, and less than this is rounding."""
 TIE = 8.0
 """Difference of held-out log likelihood up to which effects are not separable by the recording, nats."""
+COLLINEAR = 1e-3
+"""
+Share of the gain of an effect that is smooth in time up to which another such effect is not separable from it: the wander of a bias
+follows no model well enough to separate curves that are so alike.
+"""
 IMPLAUSIBLE = 8.0
 """Price of a size above that of any known instrument, nats: a plausible effect with the same fit is preferred."""
 MOST_FINDINGS = 6
@@ -219,13 +224,16 @@ class Search:
                     most: int | None = CLASS_SIZE - 1) -> list[tuple[Question, float]]:
         """Return (question, difference in nats) of effects that would do as well in the place of `question`, best first, at most `most`."""
         place, cost = chosen.index(question), self.cost(chosen)
-        found = {}
+        found, alike = {}, TIE
+        if question.effect.smooth:
+            alike = max(TIE, COLLINEAR * (self.cost([each for each in chosen if each is not question]) - cost))
         for other in self.others(chosen):
             trial = [*chosen[:place], other, *chosen[place + 1:]]
-            difference = self.cost(trial, cost + TIE) - cost
+            tie = alike if other.effect.smooth else TIE
+            difference = self.cost(trial, cost + tie) - cost
             if question.effect.contained_in == other.name:
                 continue  # a special case with an equal fit is preferred, and the general effect is not its rival
-            if difference < TIE and self.allowed(trial, other):
+            if difference < tie and self.allowed(trial, other):
                 if other.name not in found or difference < found[other.name][1]:
                     found[other.name] = (other, difference)
         return sorted(found.values(), key=lambda pair: pair[1])[:most]

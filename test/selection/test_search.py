@@ -328,6 +328,16 @@ def test_what_replaces_an_effect_is_significant_itself():
         assert Search(evidence, (), [QUADRATIC, PRODUCT]).reconsidered([QUADRATIC]) == [kept]
 
 
+@pytest.mark.parametrize('behind, alike', [(30.0, ['gyro_thermal_bias']), (90.0, [])])
+def test_curves_in_time_that_are_nearly_collinear_are_named_together(behind, alike):
+    """Of 60,000 nats, 30 do not separate two curves that the wander of a bias may bend; they separate causes that depend on motion."""
+    warm, drift, product = (asked('gyroscope', name, *at) for name, at in (('gyro_thermal_bias', (0, 1, 2)), ('gyro_bias_drift', (3, 4, 5, 6)),
+                                                                           ('gyro_rate_product', (7, 8, 9))))
+    evidence = Known(lambda used: 0.0 if 3 in used else 2 * (behind + 1.0) if used & {0, 7} else 120000.0)
+    search = Search(evidence, (), [warm, drift, product])
+    assert [mate.name for mate, _ in search.class_mates([drift], drift)] == alike
+
+
 def test_what_was_resolved_is_not_replaced():
     """The drift outweighs the lag, which could not come back beside it."""
     lag, drift = asked('gyroscope', 'gyro_delay', 0), replace(DRIFT, parameters=(1,))

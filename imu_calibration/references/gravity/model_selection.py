@@ -124,7 +124,7 @@ class HandInvestigation(Named):
     def unexplained(self) -> dict[str, Unexplained]:
         """Sensor -> the residual that no finding explains."""
         blocks, evidence, used = self.inquiry.blocks, self.inquiry.evidence, self.search.used(self.named)
-        return {sensor: unexplained_by_hand(self.baseline, blocks, evidence, used, sensor=sensor) for sensor in SENSORS}
+        return {sensor: unexplained_by_hand(self.baseline, blocks, evidence, used=used, sensor=sensor) for sensor in SENSORS}
 
     def point(self, inquiry: Inquiry, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
         """Return effect -> initial values for its columns, of the warm-ups among the chosen effects, from the rows of `inquiry`."""

@@ -20,8 +20,8 @@ TURN_RESIDUAL_UNIT = 'rad/turn'
 """Unit of the residual of turns: the angle between predicted and measured gravity after a turn."""
 
 
-def unexplained_by_hand(hand: HandCalibration, blocks: Sequence[Block], evidence: HandEvidence, used: Sequence[int], *,
-                        sensor: str) -> Unexplained:
+def unexplained_by_hand(hand: HandCalibration, blocks: Sequence[Block], evidence: HandEvidence, *,
+                        used: Sequence[int], sensor: str) -> Unexplained:
     """
     Return the unexplained residual of one sensor: its rows at rest and its turns against the expectation from noise.
 
