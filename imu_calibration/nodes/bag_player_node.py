@@ -5,7 +5,6 @@ import sys
 from dataclasses import dataclass
 
 import numpy as np
-import rclpy
 from rclpy.node import Node
 
 from imu_calibration.core.errors import InputError
@@ -52,17 +51,21 @@ class BagPlayerNode(Node):
         first = next((int(raw.received_ns[0]) for raw in self._bag.raw_stretches(self._topics)), 0)
         pace = Pace(self.settings.rate, 100.0 if self.settings.clock else 0.0, self.settings.wait_for_subscribers)
         self._playback = Playback(self, self._players, self._batches(first), pace=pace, clock_start_ns=first, awaited=self._players,
-                                  on_end=self._ended)
-        self.failed = self._is_over = False
+                                  ended='played {} messages', ends_node=self.settings.stop_at_end)
         self._playback.start()
         self.get_logger().info(f'plays {files.user_path(self.settings.bag)} at {self.settings.rate:g} times its speed: '
                                f'{", ".join(self._topics)}')
 
     def close(self) -> str:
         """Stop publishing and close the files; return the outcome."""
-        self._playback.end()
+        outcome = self._playback.end()
         self._bag.close()
-        return '' if self._is_over else f'stopped after {self._playback.n_published} messages'
+        return outcome
+
+    @property
+    def failed(self) -> bool:
+        """Whether an error ended the playback."""
+        return self._playback.failed
 
     def _open(self):
         path = self.settings.bag
@@ -110,15 +113,6 @@ class BagPlayerNode(Node):
             offset = until + PAUSE
             if not self.settings.loop:
                 return
-
-    def _ended(self, error):
-        self._is_over, self.failed = True, error is not None and rclpy.ok()
-        if self.failed:
-            self.get_logger().error(f'stopped playing: {type(error).__name__}: {error}')
-        elif error is None:
-            self.get_logger().info(f'played {self._playback.n_published} messages')
-        if error is not None or self.settings.stop_at_end:
-            rclpy.try_shutdown()
 
 
 def _message_class(message_type):

@@ -1,19 +1,20 @@
 """Publishing serialized messages at their times: in real time, faster, or as fast as subscribers receive them."""
 
-import queue
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
+import rclpy
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
-AHEAD = 3
-"""Batches that are made ahead of their time."""
+from msg_adapters.storage import read_ahead
+
 SHORTEST_SLEEP = 0.001
 """Seconds; messages that are due by then are published together."""
 PLAYBACK_DEPTH = 20_000
@@ -54,76 +55,64 @@ class Playback(threading.Thread):
     ----------
     node : rclpy.node.Node
     publishers : list of Publisher
-    batches : iterator of Batch
+    batches : generator of Batch
     pace : Pace
     clock_start_ns : int
         Time on /clock at the start.
     awaited : list of Publisher
         Publishers whose subscribers are waited for.
-    on_end : callable
-        Called when all is out, or with the exception that ended it.
+    ended : str
+        Line that is logged at the end, with ``{}`` for the number of messages.
+    ends_node : bool
+        Whether the node ends after the last message; after an error it always ends.
 
     """
 
-    def __init__(self, node: Node, publishers: Sequence, batches: Iterator[Batch], *, pace: Pace, clock_start_ns: int = 0,
-                 awaited: Sequence = (), on_end: Callable[[BaseException | None], None] = lambda error: None):
+    def __init__(self, node: Node, publishers: Sequence, batches: Generator[Batch, None, None], *, pace: Pace, ended: str,
+                 clock_start_ns: int = 0, awaited: Sequence = (), ends_node: bool = True):
         super().__init__(name='playback', daemon=True)
-        self._publishers, self._batches, self._pace, self._awaited, self._on_end = publishers, batches, pace, awaited, on_end
+        self._node, self._publishers, self._batches, self._pace, self._awaited = node, publishers, batches, pace, awaited
+        self._end_text, self._ends_node = ended, ends_node
         self._clock_start_ns, self._next_clock = clock_start_ns, 0.0
         self._clock = node.create_publisher(Clock, '/clock', QoSProfile(depth=10)) if pace.clock_rate else None
-        self._ready = queue.Queue(maxsize=AHEAD)
         self._ending = threading.Event()
-        self.n_published = 0
+        self._n_published, self._is_over, self.failed = 0, False, False
 
-    def end(self) -> None:
-        """Stop as soon as possible."""
+    def end(self) -> str:
+        """Stop as soon as possible; return the outcome, '' when all messages were published."""
         self._ending.set()
         if self.is_alive():
             self.join(5.0)
+        return '' if self._is_over else f'stopped after {self._n_published} messages'
 
     def run(self) -> None:
         """Publish everything."""
-        error = None
+        error: BaseException | None = None
         try:
-            maker = threading.Thread(target=self._make, daemon=True)
-            maker.start()
-            self._wait_for_subscribers()
-            start = time.monotonic()
-            while (batch := self._next()) is not None:
-                if isinstance(batch, BaseException):
-                    raise batch
-                self._publish(batch, start)
-            if not self._ending.is_set():
-                self._settle()
+            self._play()
         except BaseException as raised:
             error = raised
-        if not self._ending.is_set():
-            self._on_end(error)
+        if self._ending.is_set():
+            return
+        self._is_over, self.failed = True, error is not None and rclpy.ok()
+        if self.failed:
+            self._node.get_logger().error(f'stopped publishing: {type(error).__name__}: {error}')
+        elif error is None:
+            self._node.get_logger().info(self._end_text.format(self._n_published))
+        if error is not None or self._ends_node:
+            rclpy.try_shutdown()
 
-    def _make(self):
-        try:
-            for batch in self._batches:
-                self._offer(batch)
+    def _play(self):
+        start = None
+        with closing(read_ahead(self._batches)) as batches:
+            for batch in batches:
+                if start is None:
+                    self._wait_for_subscribers()
+                    start = time.monotonic()
+                self._publish(batch, start)
                 if self._ending.is_set():
                     return
-            self._offer(None)
-        except BaseException as error:
-            self._offer(error)
-
-    def _offer(self, batch):
-        while not self._ending.is_set():
-            try:
-                return self._ready.put(batch, timeout=0.2)
-            except queue.Full:
-                continue
-
-    def _next(self):
-        while not self._ending.is_set():
-            try:
-                return self._ready.get(timeout=0.2)
-            except queue.Empty:
-                continue
-        return None
+        self._settle()
 
     def _wait_for_subscribers(self):
         while any(publisher.get_subscription_count() < self._pace.subscribers for publisher in self._awaited):
@@ -142,7 +131,7 @@ class Playback(threading.Thread):
             self._tick(float(batch.time[min(upto, len(batch.time) - 1)]) if not self._pace.factor else now)
             for publisher, message in zip(batch.publisher[done:upto], batch.messages[done:upto], strict=True):
                 publisher.publish(bytes(message))
-            self.n_published += upto - done
+            self._n_published += upto - done
             done = upto
             if self._pace.factor and done < len(batch.messages):
                 wait = (batch.time[done] - now) / self._pace.factor

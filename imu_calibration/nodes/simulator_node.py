@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import rclpy
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState, Temperature
 from std_msgs.msg import String
@@ -117,10 +116,9 @@ class SimulatorNode(Node):
         self._to = dict(zip([topic for _, topic in kinds], publishers, strict=True))
         pace = Pace(settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers)
         self._playback = Playback(self, publishers, self._batches(), pace=pace, clock_start_ns=start_ns, awaited=publishers[:1],
-                                  on_end=self._ended)
+                                  ended='the profile has ended, {} messages were published')
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._trajectories.put, 10)
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
-        self.failed = self._is_over = False
         self._playback.start()
         moves = 'rests and follows joint_trajectory' if settings.profile in NO_PROFILE else f'moves by the profile {settings.profile}'
         self.get_logger().info(f'a table with the joints {", ".join(self._table.joint_names)} {moves}, '
@@ -128,8 +126,12 @@ class SimulatorNode(Node):
 
     def close(self) -> str:
         """Stop publishing; return the outcome."""
-        self._playback.end()
-        return '' if self._is_over else f'stopped after {self._playback.n_published} messages'
+        return self._playback.end()
+
+    @property
+    def failed(self) -> bool:
+        """Whether an error ended the simulation."""
+        return self._playback.failed
 
     def _make_table(self):
         settings = self.settings
@@ -205,14 +207,6 @@ class SimulatorNode(Node):
         refused = self._driven['why refused']
         text = f'the last refused trajectory: {refused}' if refused else 'follows joint_trajectory'
         return [make_status(WARN if refused else OK, 'table', text, values=dict(self._driven))]
-
-    def _ended(self, error):
-        self._is_over, self.failed = True, error is not None and rclpy.ok()
-        if self.failed:
-            self.get_logger().error(f'stopped publishing: {type(error).__name__}: {error}')
-        elif error is None:
-            self.get_logger().info(f'the profile has ended, {self._playback.n_published} messages were published')
-        rclpy.try_shutdown()
 
 
 def main(arguments: list[str] | None = None) -> int:
