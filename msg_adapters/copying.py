@@ -14,7 +14,7 @@ from msg_adapters.bag_writer import BagWriter
 from msg_adapters.decode import FrameChoice, in_order
 from msg_adapters.definitions import is_standard, standard_definition
 from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, patch_imu_group
-from msg_adapters.layout import MessageError, Packed, from_ns, group_by_layout
+from msg_adapters.layout import Packed, from_ns, group_by_layout
 
 
 def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike[str], imu_topic: str, *, corrected_topic: str,
@@ -108,12 +108,9 @@ class _Patch:
 
     def __call__(self, packed, received_ns):
         """Return (index of the messages that could be corrected, their corrected messages); a zero stamp counts as the time of arrival."""
-        groups, rest = group_by_layout(packed, find_imu_layout)
-        for k in rest:
-            try:
-                groups.append((find_imu_layout(packed.message(k)), np.array([k]), packed.select([k])))
-            except MessageError:
-                self.dropped['Imu message that cannot be decoded'] += 1
+        groups, n_broken = group_by_layout(packed, find_imu_layout)
+        if n_broken:
+            self.dropped['Imu message that cannot be decoded'] += n_broken
         groups = [group for group in groups if self.choice.wants(group[0].names[0], len(group[1]))]
         if not groups:
             return np.zeros(0, dtype=int), []

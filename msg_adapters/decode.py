@@ -1,4 +1,4 @@
-"""Messages of one topic to samples: complete groups of one layout at once, or object by object."""
+"""Messages of one topic to samples: complete groups of one layout at once."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -8,20 +8,10 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from msg_adapters.imu import (
-    IMU_TYPE,
-    TEMPERATURE_TYPE,
-    decode_imu,
-    decode_temperature,
-    find_imu_layout,
-    find_temperature_layout,
-    imu_from_rows,
-    imu_row,
-    temperature_from_rows,
-    temperature_row,
-)
-from msg_adapters.joint_state import JOINT_STATE_TYPE, decode_joints, find_joint_layout, joint_row, joints_from_rows
-from msg_adapters.layout import MessageError, Packed, UnusableMessage, clean_name, group_by_layout
+from msg_adapters.definitions import standard_bytes
+from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE, decode_imu, decode_temperature, find_imu_layout, find_temperature_layout
+from msg_adapters.joint_state import JOINT_STATE_TYPE, decode_joints, find_joint_layout
+from msg_adapters.layout import MessageLayout, Packed, UnusableMessage, group_by_layout
 
 JOINT_PATIENCE = 1000
 """So many JointState messages may pass before one fits the table."""
@@ -40,14 +30,12 @@ class Decoder:
     message_type : str
         Imu or Temperature; JointState has its own class.
     deserialize : callable, optional
-        Message bytes -> message object, for messages that are not standard CDR: all are then decoded in this general way.
+        Message bytes -> message object, for messages that are not standard CDR; each is then converted to it.
 
     """
 
     def __init__(self, message_type: str, deserialize: Callable | None = None):
-        self.find_layout, self.decode_layout, self.read_row, self.from_rows = _FUNCTIONS[message_type]
-        self.name = message_type.rpartition('/')[2]
-        self.deserialize = deserialize
+        self.message_type, self.name, self.deserialize = message_type, message_type.rpartition('/')[2], deserialize
         self.dropped, self.notes = Counter(), Counter()
 
     def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
@@ -62,17 +50,16 @@ class Decoder:
 
         """
         if self.deserialize is not None:
-            objects = [self._deserialized(packed.message(k)) for k in range(len(packed))]
-            return self.decode_objects(objects, arrived_ns)
-        groups, rest = group_by_layout(packed, self.find_layout)
-        parts = [(index, self._decode_group(layout, group)) for layout, index, group in groups]
-        parts += [(rest[k:k + 1], self._decode_alone(packed.message(number))) for k, number in enumerate(rest)]
+            packed = Packed.join([self._standard(packed.message(k)) for k in range(len(packed))])
+        groups, n_broken = group_by_layout(packed, FIND_LAYOUT[self.message_type])
+        if n_broken:
+            self.dropped[f'{self.name} message that cannot be decoded'] += n_broken
+        parts = [(index, self._samples(layout, group)) for layout, index, group in groups]
         return in_order([(index, self._stamped(samples, index, arrived_ns)) for index, samples in parts if samples is not None])
 
-    def decode_objects(self, messages: Iterable, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
-        """Return the samples of message objects, from rclpy or rosbags, or None when there are none; `arrived_ns` as for `decode`."""
-        rows = [(k, row) for k, row in enumerate(map(self._row, messages)) if row is not None]
-        return self._stamped(self.from_rows([row for _, row in rows]), np.array([k for k, _ in rows]), arrived_ns) if rows else None
+    def decode_group(self, layout: MessageLayout, packed: Packed) -> Any:
+        """Return the samples of messages of one layout, None for messages that are not wanted (raises UnusableMessage)."""
+        return (decode_imu if self.message_type == IMU_TYPE else decode_temperature)(layout, packed)
 
     def _stamped(self, samples, index, arrived_ns):
         """Return the samples with the time of arrival where a driver has set no stamp."""
@@ -82,36 +69,19 @@ class Decoder:
         self.notes[f'{self.name} zero stamp'] += int(unset.sum())
         return replace(samples, stamp_ns=np.where(unset, arrived_ns()[index], samples.stamp_ns))
 
-    def _decode_group(self, layout, packed):
+    def _samples(self, layout, packed):
         try:
-            return self.decode_layout(layout, packed)
-        except MessageError as error:
-            return self._drop(error, len(packed))
-
-    def _decode_alone(self, data):
-        try:
-            layout = self.find_layout(data)
-        except MessageError as error:
-            return self._drop(error, 1)
-        return self._decode_group(layout, Packed.join([data]))
-
-    def _deserialized(self, data):
-        try:
-            return self.deserialize(data)
-        except Exception as error:   # rosbags' generated readers raise many kinds on broken bytes
-            return self._drop(error, 1)
-
-    def _row(self, message):
-        if message is None:
+            return self.decode_group(layout, packed)
+        except UnusableMessage as error:
+            self.dropped[str(error)] += len(packed)
             return None
-        try:
-            return self.read_row(message)
-        except (AttributeError, TypeError, ValueError, IndexError, OverflowError) as error:   # fields of another definition
-            return self._drop(error, 1)
 
-    def _drop(self, error, n_messages):
-        reason = str(error) if isinstance(error, UnusableMessage) else f'{self.name} message that cannot be decoded'
-        self.dropped[reason] += n_messages
+    def _standard(self, data):
+        """Return a message as standard CDR; no bytes for one that cannot be read."""
+        try:
+            return standard_bytes(self.deserialize(data), self.message_type)
+        except Exception:   # rosbags' generated readers raise many kinds on broken bytes, and fields of other definitions differ
+            return b''
 
 
 class FrameChoice:
@@ -162,9 +132,11 @@ class ImuDecoder(Decoder):
 
     def __init__(self, choice: FrameChoice, deserialize: Callable | None = None):
         super().__init__(IMU_TYPE, deserialize)
-        self.choice, decode, read = choice, self.decode_layout, self.read_row
-        self.decode_layout = lambda layout, packed: decode(layout, packed) if choice.wants(layout.names[0], len(packed)) else None
-        self.read_row = lambda message: read(message) if choice.wants(clean_name(message.header.frame_id)) else None
+        self.choice = choice
+
+    def decode_group(self, layout: MessageLayout, packed: Packed) -> Any:
+        """As for Decoder; None for other frames."""
+        return super().decode_group(layout, packed) if self.choice.wants(layout.names[0], len(packed)) else None
 
 
 class JointDecoder(Decoder):
@@ -186,18 +158,23 @@ class JointDecoder(Decoder):
         self.names = () if joint_names is None else tuple(joint_names)
         self.seen = []
         self.n_messages, self.n_fitting = 0, 0
-        self.decode_layout = lambda layout, packed: decode_joints(layout, packed, self._expected(layout.names))
-        self.read_row = lambda message: joint_row(message, self._expected(tuple(map(clean_name, message.name))))
-        self.from_rows = lambda rows: joints_from_rows(rows, self.names)
 
     def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
         """As for Decoder; raises InputError when the names have not matched the table's for a number of messages."""
-        return self._checked(super().decode(packed, arrived_ns), len(packed) if self.deserialize is None else 0)
+        samples = super().decode(packed, arrived_ns)
+        self.n_messages += len(packed)
+        self.n_fitting += 0 if samples is None else len(samples)
+        if self.n_messages >= JOINT_PATIENCE:
+            self.check()
+        return samples
 
-    def decode_objects(self, messages: Iterable, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
-        """As for Decoder; raises InputError when the names have not matched the table's for a number of messages."""
-        messages = list(messages)
-        return self._checked(super().decode_objects(messages, arrived_ns), len(messages))
+    def decode_group(self, layout: MessageLayout, packed: Packed) -> Any:
+        """Return the JointSamples in the order of the table; its joints are those of the first message where none were given."""
+        if layout.names not in self.seen and len(self.seen) < KEPT_NAMES:
+            self.seen.append(layout.names)
+        if not self.asked and not self.names:
+            self.names = layout.names
+        return decode_joints(layout, packed, self.names)
 
     def check(self) -> None:
         """Raise InputError when no message so far contains the joints of the table."""
@@ -210,20 +187,6 @@ class JointDecoder(Decoder):
             raise InputError(f'JointState must name the joints of the table ({", ".join(self.names)}), got {came}, which lacks '
                              f'{", ".join(missing)}; correct the names in the table description, or choose another topic',
                              key='joint_topic', code='joint_names')
-
-    def _checked(self, samples, n_messages):
-        self.n_messages += n_messages
-        self.n_fitting += 0 if samples is None else len(samples)
-        if self.n_messages >= JOINT_PATIENCE:
-            self.check()
-        return samples
-
-    def _expected(self, names):
-        if names not in self.seen and len(self.seen) < KEPT_NAMES:
-            self.seen.append(names)
-        if not self.asked and not self.names:
-            self.names = names
-        return self.names
 
 
 def taken_counts(decoders: Iterable[Decoder]) -> tuple[dict[str, int] | None, ...]:
@@ -245,8 +208,6 @@ def in_order(parts: Sequence[Any]) -> Any:
     return joined.select(np.argsort(np.concatenate([index for index, _ in parts]), kind='stable'))
 
 
-_FUNCTIONS: dict[str, tuple[Callable, ...]] = {
-    IMU_TYPE: (find_imu_layout, decode_imu, imu_row, imu_from_rows),
-    JOINT_STATE_TYPE: (find_joint_layout, decode_joints, joint_row, joints_from_rows),
-    TEMPERATURE_TYPE: (find_temperature_layout, decode_temperature, temperature_row, temperature_from_rows),
-}
+FIND_LAYOUT: dict[str, Callable[[bytes], MessageLayout]] = {
+    IMU_TYPE: find_imu_layout, JOINT_STATE_TYPE: find_joint_layout, TEMPERATURE_TYPE: find_temperature_layout}
+"""Message type -> function from bytes to MessageLayout (raises MessageError)."""

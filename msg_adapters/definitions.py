@@ -3,10 +3,12 @@
 from collections.abc import Callable
 from functools import cache
 from itertools import count
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
-from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE
+from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, standard_store
 
 SEPARATOR = '=' * 80
 MAX_DEFINITION_CHARACTERS, MAX_ELEMENTS = 100_000, 10_000
@@ -32,8 +34,7 @@ class TypeDefinition(NamedTuple):
 @cache
 def standard_definition(message_type: str) -> TypeDefinition:
     """Return the TypeDefinition of a type that this package supports, as in ROS 2 Jazzy."""
-    from rosbags.typesys import Stores, get_typestore
-    store = get_typestore(Stores.ROS2_JAZZY)
+    store = standard_store()
     return TypeDefinition(message_type, 'ros2msg', store.generate_msgdef(message_type, ros_version=2)[0], store.hash_rihs01(message_type))
 
 
@@ -79,6 +80,23 @@ def deserializer(message_type: str, definitions: dict[str, tuple[str, str]], ros
     store.register(types)
     deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
     return lambda data: deserialize(data, message_type)
+
+
+def standard_bytes(message: Any, message_type: str) -> bytes:
+    """Return a message object of any definition as plain CDR of the standard one; fields are found by their names."""
+    return bytes(standard_store().serialize_cdr(_standard(message, message_type), message_type))
+
+
+def _standard(message, message_type):
+    store, fields = standard_store(), []
+    for name, (kind, content) in store.fielddefs[message_type][1]:
+        value = getattr(message, name)
+        if kind.name == 'NAME':
+            value = _standard(value, content)
+        elif kind.name in ('ARRAY', 'SEQUENCE') and content[0][1][0] == 'float64':
+            value = np.asarray(value, np.float64)
+        fields.append(value)
+    return store.types[message_type](*fields)
 
 
 def _require_size(types, message_type):

@@ -1,8 +1,6 @@
 """Imu and Temperature messages."""
 
 import struct
-from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -14,8 +12,6 @@ from msg_adapters.layout import (
     MessageLayout,
     Packed,
     aligned,
-    clean_name,
-    header_stamp_ns,
     open_header,
     overlapping,
 )
@@ -79,29 +75,12 @@ def patch_imu_group(layout: MessageLayout, packed: Packed, fields: dict[str, np.
     return np.concatenate([table[:, :FRAME_OFFSET], head, table[:, body:]], axis=1)
 
 
-def imu_row(message: Any) -> tuple[int, tuple[float, float, float], tuple[float, float, float], str]:
-    """Return (stamp_ns, force, rate, frame_id) of a message object of rclpy or rosbags; absent readings as NaN."""
-    force = _reading(message.linear_acceleration, message.linear_acceleration_covariance)
-    rate = _reading(message.angular_velocity, message.angular_velocity_covariance)
-    return header_stamp_ns(message), force, rate, clean_name(message.header.frame_id)
-
-
-def imu_from_rows(rows: Sequence[Any]) -> ImuSamples:
-    """Return ImuSamples from rows of `imu_row`."""
-    stamp_ns, force_s, rate_s, frames = zip(*rows, strict=True)
-    return ImuSamples(np.array(stamp_ns, dtype=np.int64), np.array(force_s, dtype=float), np.array(rate_s, dtype=float), frames[0])
-
-
-def _reading(vector, covariance):
-    return (np.nan,) * 3 if covariance[0] == -1.0 else (float(vector.x), float(vector.y), float(vector.z))
-
-
-def open_message(data: bytes) -> tuple[Header, int]:
-    """Check the bytes and return (Header, offset of the doubles)."""
+def open_message(data: bytes, kind: str = 'Imu', n_doubles: int = N_DOUBLES) -> tuple[Header, int]:
+    """Check the bytes of a message with doubles after its header and return (Header, offset of the doubles)."""
     header = open_header(data)
     body = aligned(header.end, 8)
-    if len(data) < body + 8 * N_DOUBLES:
-        raise MessageError(f'an Imu message with its doubles at byte {body} has {body + 8 * N_DOUBLES} bytes, got {len(data)}')
+    if len(data) < body + 8 * n_doubles:
+        raise MessageError(f'a message of type {kind} with its doubles at byte {body} has {body + 8 * n_doubles} bytes, got {len(data)}')
     return header, body
 
 
@@ -117,10 +96,7 @@ TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
 
 def find_temperature_layout(data: bytes) -> MessageLayout:
     """Return the MessageLayout of a serialized Temperature message (raises MessageError)."""
-    header = open_header(data)
-    body = aligned(header.end, 8)
-    if len(data) < body + 16:
-        raise MessageError(f'a Temperature message with its doubles at byte {body} has {body + 16} bytes, got {len(data)}')
+    header, body = open_message(data, 'Temperature', 2)
     fixed = ((0, 2), (FRAME_OFFSET, header.end))
     return MessageLayout(header.order, len(data), bytes(data), fixed, {'temperature_c': (body, 1)},
                          (header.frame_id,))
@@ -129,14 +105,3 @@ def find_temperature_layout(data: bytes) -> MessageLayout:
 def decode_temperature(layout: MessageLayout, packed: Packed) -> TemperatureSamples:
     """Decode messages of one layout into TemperatureSamples."""
     return TemperatureSamples(layout.stamp_ns(packed), layout.column(packed, 'temperature_c')[:, 0])
-
-
-def temperature_row(message: Any) -> tuple[int, float]:
-    """Return (stamp_ns, temperature) of a message object of rclpy or rosbags."""
-    return header_stamp_ns(message), float(message.temperature)
-
-
-def temperature_from_rows(rows: Sequence[tuple[float, float]]) -> TemperatureSamples:
-    """Return TemperatureSamples from rows of `temperature_row`."""
-    stamp_ns, temperature_c = zip(*rows, strict=True)
-    return TemperatureSamples(np.array(stamp_ns, dtype=np.int64), np.array(temperature_c, dtype=float))

@@ -19,7 +19,6 @@ from msg_adapters.layout import (
     UnusableMessage,
     aligned,
     clean_name,
-    header_stamp_ns,
     open_header,
 )
 
@@ -73,25 +72,10 @@ def decode_joints(layout: MessageLayout, packed: Packed, joint_names: Sequence[s
     return JointSamples(layout.stamp_ns(packed), position, velocity, tuple(joint_names))
 
 
-def joint_row(message: Any, joint_names: Sequence[str]) -> tuple[int, list[float], list[float]]:
-    """Return (stamp_ns, positions, velocities) of a message object of rclpy or rosbags (raises UnusableMessage)."""
-    columns = joint_columns(list(map(clean_name, message.name)), len(message.position), joint_names)
-    has_velocity = len(message.velocity) == len(message.name)
-    velocity = [float(message.velocity[k]) for k in columns] if has_velocity else [np.nan] * len(columns)
-    return header_stamp_ns(message), [float(message.position[k]) for k in columns], velocity
-
-
-def joints_from_rows(rows: Sequence[tuple[float, Sequence[float], Sequence[float]]], joint_names: Sequence[str]) -> JointSamples:
-    """Return JointSamples from rows of `joint_row`."""
-    stamp_ns, position, velocity = zip(*rows, strict=True)
-    return JointSamples(np.array(stamp_ns, dtype=np.int64), np.array(position, dtype=float), np.array(velocity, dtype=float),
-                        tuple(joint_names))
-
-
 def joint_columns(names: Sequence[str], n_positions: int, joint_names: Sequence[str]) -> list[int]:
     """Return the positions of the joints in a message with `names` (raises UnusableMessage)."""
     names = list(names)
-    if len(names) > MAX_MESSAGE_JOINTS or any(name not in names for name in joint_names):
+    if any(name not in names for name in joint_names):
         raise UnusableMessage(MISSING_JOINT)
     if n_positions != len(names):
         raise UnusableMessage(NO_POSITION)
@@ -139,7 +123,7 @@ _FIELDS = {'position': 'positions', 'rate': 'velocities', 'acceleration': 'accel
 
 
 @cache
-def _store() -> Any:
+def standard_store() -> Any:
     """Return rosbags' standard types; the first call takes a third of a second."""
     from rosbags.typesys import Stores, get_typestore
     return get_typestore(Stores.ROS2_JAZZY)
@@ -147,7 +131,7 @@ def _store() -> Any:
 
 def encode_trajectory(points: TrajectoryPoints) -> bytes:
     """Return TrajectoryPoints as plain little-endian CDR, without a frame, to begin at their arrival."""
-    types, none = _store().types, np.zeros(0)
+    types, none = standard_store().types, np.zeros(0)
     columns = {name: np.ascontiguousarray(values) for name, values in points.columns().items()}   # each row is serialized as its bytes
     duration = types['builtin_interfaces/msg/Duration']
     listed = [types['trajectory_msgs/msg/JointTrajectoryPoint'](*(columns[name][k] if name in columns else none for name in _FIELDS), none,
@@ -155,7 +139,7 @@ def encode_trajectory(points: TrajectoryPoints) -> bytes:
               for k, time in enumerate(points.time)]
     header = types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](0, 0), '')
     message = types[JOINT_TRAJECTORY_TYPE](header, list(points.joint_names), listed)
-    return bytes(_store().serialize_cdr(message, JOINT_TRAJECTORY_TYPE))
+    return bytes(standard_store().serialize_cdr(message, JOINT_TRAJECTORY_TYPE))
 
 
 def trajectory_from_message(message: Any) -> TrajectoryPoints:

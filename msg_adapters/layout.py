@@ -3,14 +3,14 @@
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from imu_calibration.core.errors import printable
 
 MAX_LAYOUTS = 16
-"""A stretch with more layouts than this is not worth grouping; the rest of it is decoded message by message."""
+"""A stretch with more layouts than this is not worth grouping; its further messages are decoded one by one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +118,9 @@ class MessageLayout:
         return rows.view(self.order + 'f8').reshape(-1, count).astype(float, copy=False)
 
 
-def group_by_layout(packed: Packed, find_layout: Callable) -> tuple[list[tuple[MessageLayout, np.ndarray, Packed]], np.ndarray]:
+def group_by_layout(packed: Packed, find_layout: Callable) -> tuple[list[tuple[MessageLayout, np.ndarray, Packed]], int]:
     """
-    Split messages into groups of one layout each.
+    Split messages into groups of one layout each; after `MAX_LAYOUTS` groups each message is one.
 
     Parameters
     ----------
@@ -133,25 +133,24 @@ def group_by_layout(packed: Packed, find_layout: Callable) -> tuple[list[tuple[M
     -------
     groups : list of (MessageLayout, index, Packed)
         Integer indices in ascending order per group, and these messages.
-    rest : ndarray
-        Indices of the messages that no group holds: invalid ones, and ungrouped ones after `MAX_LAYOUTS`.
+    n_broken : int
+        Messages that are invalid.
 
     """
-    groups, broken, rest = [], [], np.arange(len(packed))
-    while len(rest) and len(groups) + len(broken) < MAX_LAYOUTS:
+    groups, n_broken, rest = [], 0, np.arange(len(packed))
+    while len(rest):
         try:
             layout = find_layout(packed.message(rest[0]))
         except MessageError:
-            broken.append(rest[:1])
-            rest = rest[1:]
+            n_broken, rest = n_broken + 1, rest[1:]
             continue
-        left = packed.select(rest) if len(rest) < len(packed) else packed
-        same = layout.matches(left)
-        if same.all():
-            return [*groups, (layout, rest, left)], np.array(broken, dtype=int).ravel()
-        groups.append((layout, rest[same], left.select(same)))
-        rest = rest[~same]
-    return groups, np.sort(np.concatenate([*broken, rest]))
+        if len(groups) + n_broken < MAX_LAYOUTS:
+            same = layout.matches(packed.select(rest))
+            own, rest = rest[same], rest[~same]
+        else:
+            own, rest = rest[:1], rest[1:]
+        groups.append((layout, own, packed.select(own)))
+    return groups, n_broken
 
 
 def overlapping(buffer: np.ndarray, dtype: str) -> np.ndarray:
@@ -269,12 +268,3 @@ def to_ns(sec: int, nanosec: int) -> int:
 def from_ns(stamp_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (sec, nanosec) of an integer stamp; works on numbers and on int64 arrays."""
     return stamp_ns // NS_PER_S, stamp_ns % NS_PER_S
-
-
-def header_stamp_ns(message: Any) -> int:
-    """Return the header stamp of a message object, from rclpy or from rosbags (ROS 1 messages have nsec)."""
-    stamp = message.header.stamp
-    stamp_ns = to_ns(int(stamp.sec), int(stamp.nanosec))
-    if abs(stamp_ns) >= 2**63:
-        raise MessageError(f'a stamp must fit into 64 bits, got {stamp_ns} ns')
-    return stamp_ns

@@ -10,15 +10,15 @@ import numpy as np
 from imu_calibration.core.samples import SampleBlock
 from msg_adapters.decode import Decoder, JointDecoder, taken_counts
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
-from msg_adapters.layout import Packed, UnusableMessage, clean_name
+from msg_adapters.layout import MessageLayout, Packed, UnusableMessage, clean_name
 
 
 class LiveGatherer:
     """
     Keep messages until `flush` turns them into a SampleBlock.
 
-    Adding is cheap and may happen in another thread than `flush`. Every topic gives either serialized messages (a
-    subscription with ``raw=True``), which are decoded many at once, or message objects, which are read by attribute.
+    Adding is cheap and may happen in another thread than `flush`. Every topic gives serialized messages (a subscription with
+    ``raw=True``), which are decoded many at once.
 
     Parameters
     ----------
@@ -37,15 +37,15 @@ class LiveGatherer:
                         'temperature': _Topic(Decoder(TEMPERATURE_TYPE), max_messages)}
 
     def add_imu(self, message: bytes, sent_ns: int = 0) -> None:
-        """Add an Imu message: bytes or a message object, and when it was sent, ns."""
+        """Add an Imu message, serialized, and when it was sent, ns."""
         self._topics['imu'].add(message, sent_ns)
 
-    def add_joints(self, message: Any, sent_ns: int = 0) -> None:
-        """Add a JointState message: bytes or a message object."""
+    def add_joints(self, message: bytes, sent_ns: int = 0) -> None:
+        """Add a JointState message."""
         self._topics['joints'].add(message, sent_ns)
 
-    def add_temperature(self, message: Any, sent_ns: int = 0) -> None:
-        """Add a Temperature message: bytes or a message object."""
+    def add_temperature(self, message: bytes, sent_ns: int = 0) -> None:
+        """Add a Temperature message."""
         self._topics['temperature'].add(message, sent_ns)
 
     def __len__(self) -> int:
@@ -80,15 +80,13 @@ class FrameDecoder(Decoder):
     def __init__(self, frame_id: str = ''):
         super().__init__(IMU_TYPE)
         self.frame_id = clean_name(frame_id)
-        decode_layout, read_row = self.decode_layout, self.read_row
-        self.decode_layout = lambda layout, packed: decode_layout(self._checked(layout, layout.names[0]), packed)
-        self.read_row = lambda message: read_row(self._checked(message, clean_name(message.header.frame_id)))
 
-    def _checked(self, passed, frame_id):
-        self.frame_id = self.frame_id or frame_id
-        if frame_id != self.frame_id:
+    def decode_group(self, layout: MessageLayout, packed: Packed) -> Any:
+        """As for Decoder; raises UnusableMessage for another frame."""
+        self.frame_id = self.frame_id or layout.names[0]
+        if layout.names[0] != self.frame_id:
             raise UnusableMessage(f"Imu message of another frame than '{self.frame_id}'")
-        return passed
+        return super().decode_group(layout, packed)
 
 
 class _Topic:
@@ -112,8 +110,4 @@ class _Topic:
         if n_lost:
             self.decoder.dropped[f'{self.decoder.name} message that was dropped because the queue was full'] += n_lost
         sent_ns = np.array([sent for _, sent in messages], np.int64)
-        contents = [message for message, _ in messages]
-        arrived_ns = (lambda: sent_ns) if np.all(sent_ns) else None
-        if contents and isinstance(contents[0], (bytes, bytearray, memoryview)):
-            return self.decoder.decode(Packed.join(contents), arrived_ns)
-        return self.decoder.decode_objects(contents, arrived_ns)
+        return self.decoder.decode(Packed.join([message for message, _ in messages]), (lambda: sent_ns) if np.all(sent_ns) else None)

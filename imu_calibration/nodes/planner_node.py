@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -55,8 +54,8 @@ from imu_calibration.planning.situation import expected_noise, require_grade
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.use_cases.resources import config_file
-from msg_adapters.joint_state import joint_row
-from msg_adapters.layout import UnusableMessage
+from msg_adapters.joint_state import decode_joints, find_joint_layout
+from msg_adapters.layout import MessageError, Packed
 
 
 @dataclass(frozen=True)
@@ -202,15 +201,15 @@ class PlannerNode(Node):
 
     def _joint_state(self, serialized: bytes, _: int) -> None:
         try:
-            stamp_ns, position, rate = joint_row(deserialize_message(serialized, JointState), self._names)
-        except UnusableMessage as error:
+            samples = decode_joints(find_joint_layout(serialized), Packed.join([serialized]), self._names)
+        except MessageError as error:
             self._complaints.event(f'joint_states: {error}; it is left out')
             return
         now = time.monotonic()
-        self._stamp = stamp_ns * 1e-9 if stamp_ns else now
+        self._stamp = float(samples.stamp_ns[0]) * 1e-9 if samples.stamp_ns[0] else now
         with self._lock:
             ignored = dict(self.driver.ignored)
-            must_stop = self.driver.observe(self._stamp, np.array(position), np.array(rate), now=now)
+            must_stop = self.driver.observe(self._stamp, samples.position[0], samples.velocity[0], now=now)
         if self.driver.ignored != ignored:
             self._complaints.event(f'joint_states: positions must be finite{self.driver.ignored_words()}; see the driver of that joint')
         if must_stop:
