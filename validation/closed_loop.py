@@ -8,6 +8,7 @@ z = (second size - first size) / (sd of the second) has a standard deviation of 
 """
 
 import argparse
+import re
 import time
 from dataclasses import replace
 
@@ -37,6 +38,8 @@ TEMPLATES = {
     'table vector and order': ('gyroscope', ['cos(2 * angle_1) * c_xx', 'cos(2 * angle_1) * c_yx', 'cos(2 * angle_1) * c_zx'], 'rad/s', 1e-3),
 }
 """Template of the grammar -> (sensor, column, unit, size of each axis, SI)."""
+PHASE, SAME_PHASE = re.compile(r' ([+-]) ([\d.e-]+)(?=\))'), 0.01
+"""Phase in the column of a formula, and the largest difference of estimates of one phase, rad."""
 SIZE = 1.0
 """Hidden size of a catalogue effect as a share of its largest plausible one."""
 
@@ -75,12 +78,20 @@ def values_of(calibration):
     return found
 
 
+def same_formula(column, known):
+    """Return whether two columns differ in their estimated phases only, by less than `SAME_PHASE`."""
+    one, other = (np.array([float(sign + phase) for sign, phase in PHASE.findall(text)]) for text in (column, known))
+    turns = one.shape == other.shape and np.angle(np.exp(1j * (one - other)))
+    return PHASE.sub('', column) == PHASE.sub('', known) and turns is not False and bool(np.all(np.abs(turns) < SAME_PHASE))
+
+
 def compared(expected, calibration, measured, seed):
     """Simulate a calibration on the motion of a session, diagnose the simulation and compare with {name: {parameter: value}}."""
     second = diagnose(replay(measured.samples, calibration, measured.table, seed=seed).samples, measured.table)
-    found = sizes_of(second)
+    known = {column: next((name for name in expected if same_formula(column, name)), column) for column in sizes_of(second)}
+    found = {known[name]: sizes for name, sizes in sizes_of(second).items()}
     classes = {finding.effect: {finding.effect, *finding.indistinguishable_from} for finding in second.findings}
-    classes |= {column: {column, *rest.proposal.alike} for rest in second.result.diagnosis.unexplained.values() if rest.proposal
+    classes |= {known[column]: {known[column], *rest.proposal.alike} for rest in second.result.diagnosis.unexplained.values() if rest.proposal
                 for column in rest.proposal.columns}
     again = [name for name in expected if any(name in members for members in classes.values())]
     z = [(value - expected[name][part]) / sd for name in expected.keys() & found.keys() for part, (value, sd) in found[name].items()
