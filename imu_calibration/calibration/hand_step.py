@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +44,19 @@ class HandStep:
     def is_turn(self) -> bool:
         """Whether the turn is large enough to count."""
         return self.axis is not None and self.angle > TURNED
+
+    @property
+    def kind(self) -> str:
+        """'turn' or 'pose'."""
+        return 'turn' if self.is_turn else 'pose'
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """Numbers of the step for plan.yaml."""
+        found: dict[str, Any] = {'up': [float(f'{c:.6g}') for c in self.up]}
+        if self.axis is not None and self.is_turn:
+            found |= {'turn_axis': [float(f'{c:.6g}') for c in self.axis], 'turn_deg': round(float(np.degrees(self.angle)), 1)}
+        return found
 
     @property
     def words(self) -> str:

@@ -11,7 +11,7 @@ from msg_adapters.storages import identifiers
 EXAMPLES = ('--table table.yaml --output plan', '--by-hand --output plan')
 CHOICES = ('tolerances', 'noise', 'accelerometer_model', 'gyroscope_model', 'reference_model', 'catalogue', 'gravity')
 MAX_PRINTED_MOTIONS = 12
-"""Motions that are printed; plan.yaml has all."""
+"""Motions of joints that are printed; plan.yaml has all."""
 
 
 def add_arguments(parser: OneLineParser) -> None:
@@ -42,35 +42,21 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Namespace) -> VerbResult:
     """Plan into a folder that can be written, print the prediction, return the exit code."""
-    if options.by_hand and options.motion == 'any':
-        return _run_by_hand(options)
-    stand = _stand(options)
     from imu_calibration.document import files
     from imu_calibration.planning.planner import plan_to_mapping
-    from imu_calibration.use_cases.plan import plan
+    from imu_calibration.use_cases.plan import by_hand, plan
+    choices = {name: getattr(options, name) for name in CHOICES}
+    stand = None if options.by_hand and options.motion == 'any' else _stand(options)
     with files.output_folder(options.output) as folder:
-        made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate,
-                    with_bound=not options.no_bound, separate=[name for name in options.separate.split(',') if name],
-                    diagnosis=options.diagnosis, around=_pose(options.around), reach=options.reach,
-                    **{name: getattr(options, name) for name in CHOICES})
+        if stand is None:
+            made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **choices)
+        else:
+            made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate,
+                        with_bound=not options.no_bound, separate=[name for name in options.separate.split(',') if name],
+                        diagnosis=options.diagnosis, around=_pose(options.around), reach=options.reach, **choices)
         made.save(folder, report=not options.no_report, storage=options.storage)
     _show(made, folder)
     return VerbResult(made.exit_code, plan_to_mapping(made.plan, made.provenance))
-
-
-def _run_by_hand(options):
-    from imu_calibration.document import files
-    from imu_calibration.planning.hand_plan import hand_plan_to_mapping
-    from imu_calibration.use_cases.plan import by_hand, hand_summary
-    with files.output_folder(options.output) as folder:
-        made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **{name: getattr(options, name) for name in CHOICES})
-        made.save(folder, report=not options.no_report)
-    for number, step in enumerate(made.plan.steps, start=1):
-        print_line(f'{number:3d}  {step.words}', '     ')
-    for line in hand_summary(made.plan):
-        print_line(line, '    ')
-    print_line(f'written: plan.yaml in {folder}')
-    return VerbResult(made.exit_code, hand_plan_to_mapping(made.plan, made.provenance))
 
 
 def _pose(text):
@@ -93,11 +79,11 @@ def _stand(options):
 
 def _show(planned, folder):
     from imu_calibration.use_cases.plan import summary
-    made = planned.plan
-    for end, motion in list(zip(made.ends, made.motions, strict=True))[:MAX_PRINTED_MOTIONS]:
+    made, most = planned.plan, None if planned.table is None else MAX_PRINTED_MOTIONS
+    for end, motion in list(zip(made.ends, made.motions, strict=True))[:most]:
         print_line(f'until {end:6.1f} s  {motion.words}', ' ' * 16)
-    if len(made.motions) > MAX_PRINTED_MOTIONS:
-        print(f'... and {len(made.motions) - MAX_PRINTED_MOTIONS} more, in plan.yaml')
+    if most is not None and len(made.motions) > most:
+        print(f'... and {len(made.motions) - most} more, in plan.yaml')
     for line in [*summary(made), *planned.notes]:
         print_line(line, '    ')
-    print_line(f'written: plan.yaml and the trajectory in {folder}')
+    print_line(f'written: plan.yaml{"" if planned.table is None else " and the trajectory"} in {folder}')

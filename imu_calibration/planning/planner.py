@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.calibration.advice import foretold, knowledge_at_first
+from imu_calibration.calibration.hand_step import HOLD_TIME, TURN_RATE
 from imu_calibration.core.progress import report
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.sensor_model import SensorModel
@@ -19,6 +21,7 @@ from imu_calibration.planning.belief import Belief
 from imu_calibration.planning.coordinates import Coordinates, ToldApart, WithinTolerances
 from imu_calibration.planning.repertoire import MotionKind, PlannedMotion, Repertoire, trajectory
 from imu_calibration.planning.situation import PROBABILITY, Situation
+from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 
@@ -146,10 +149,8 @@ class Plan:
 
     model: SensorModel
     """Parameters to be determined."""
-    motions: tuple[PlannedMotion, ...]
-    """In the order of time."""
-    start: np.ndarray
-    """Where the joints are at the beginning, shape (n_joints,)."""
+    motions: tuple[Any, ...]
+    """PlannedMotion, by hand HandStep, in the order of time."""
     ends: np.ndarray
     """When each motion ends, the way to it included, s, shape (n_motions,)."""
     sd: np.ndarray
@@ -160,12 +161,24 @@ class Plan:
     """Whether each parameter is requested, shape (n_params,)."""
     history: np.ndarray
     """Standard deviations in tolerances before the first motion and after each, of the requested parameters, shape (n_motions + 1, k)."""
-    lower_bound_seconds: float
-    """No plan made of these motions meets the tolerances in less, s; NaN where that was not worked out."""
     missing: tuple[str, ...]
     """Parameters outside their tolerance at the end, or pairs of causes that remain collinear."""
+    start: np.ndarray | None = None
+    """Where the joints are at the beginning, shape (n_joints,); None: by hand."""
+    lower_bound_seconds: float = float('nan')
+    """No plan made of these motions meets the tolerances in less, s; NaN where that was not worked out."""
     told_apart: str = ''
     """The causes that the plan separates, if that is its goal."""
+
+    @property
+    def noun(self) -> str:
+        """Plural of its motions."""
+        return 'poses and turns' if self.start is None else 'motions'
+
+    @property
+    def scope(self) -> str:
+        """Motions to choose from, in a sentence about what is out of reach."""
+        return 'by hand' if self.start is None else 'for every motion of these joints within their limits'
 
     @property
     def seconds(self) -> float:
@@ -184,10 +197,7 @@ class Plan:
     @property
     def points(self) -> TrajectoryPoints:
         """The whole plan as one trajectory."""
-        everything = tuple(segment for one in self.segments for segment in one)
-        names = tuple(self.model.joint_names)
-        return trajectory(names, everything)
-
+        return trajectory(tuple(self.model.joint_names), tuple(segment for one in self.segments for segment in one))
 
 
 class Planner:
@@ -301,9 +311,9 @@ class Planner:
         covariance, cautious = (situation.covariance_after(sequence, place, self.known, cautious=each)[0] for each in (False, True))
         steps = [situation.covariance_after(sequence[:count], place, self.known) for count in range(len(sequence) + 1)]
         self._visited.clear()
-        return Plan(coordinates.model, tuple(self._named(number) for number in sequence), start,
-                    np.array([seconds for _, seconds in steps[1:]]), coordinates.sd(covariance), coordinates.tolerances, coordinates.wanted,
-                    np.array([situation.excess(step) for step, _ in steps]), bound, situation.goal.missing(cautious),
+        return Plan(coordinates.model, tuple(self._named(number) for number in sequence), np.array([seconds for _, seconds in steps[1:]]),
+                    coordinates.sd(covariance), coordinates.tolerances, coordinates.wanted,
+                    np.array([situation.excess(step) for step, _ in steps]), situation.goal.missing(cautious), start, bound,
                     situation.goal.words)
 
     def _named(self, number: int) -> PlannedMotion:
@@ -349,35 +359,56 @@ def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: d
     return planner
 
 
+def plan_by_hand(model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str, NoiseModel], rate: float) -> Plan:
+    """
+    Return the poses and turns that bring every parameter within its tolerance, each the best per second at its time.
+
+    Parameters
+    ----------
+    model : HandModel
+    tolerances : ndarray, shape (n,)
+    noise : mapping
+        Sensor -> NoiseModel of single samples.
+    rate : float
+        Samples per second.
+
+    """
+    force_sd, rate_sd = (float(np.sqrt(noise[s].low_variance.mean() / (HOLD_TIME * rate) + sum(p.sd**2 for p in noise[s].bias_processes)))
+                         for s in ('accelerometer', 'gyroscope'))
+    turn_sd = float(np.sqrt(noise['gyroscope'].low_variance.mean() * (np.pi / TURN_RATE) / rate))
+    knowledge = knowledge_at_first(model, tolerances, noise=(force_sd, rate_sd, turn_sd))
+    steps = foretold(knowledge)
+    history = [knowledge.sd(knowledge.information)]
+    for step in steps:
+        knowledge = knowledge.then(step)
+        history.append(knowledge.sd(knowledge.information))
+    wanted = ~model.fixed
+    missing = np.array(model.model.param_names)[wanted & (history[-1] > tolerances)].tolist()
+    return Plan(model.model, tuple(steps), np.cumsum([step.seconds for step in steps]), history[-1], tolerances, wanted,
+                np.array(history)[:, wanted] / tolerances[wanted], tuple(missing))
+
+
 PLAN_FORMAT = 'imu_calibration/plan/1'
 
 
 def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
     """Return the content of plan.yaml: plain data in SI, except angles of joints in degrees, named so."""
-    begins = np.concatenate([[0.0], plan.ends[:-1]]) if len(plan.ends) else []
+    begins = [0.0, *plan.ends.tolist()]
+    of_joints = {} if plan.start is None else {
+        'probability': PROBABILITY, 'joints': list(plan.model.joint_names) if plan.motions else []}
     return {
         'format': PLAN_FORMAT,
         'seconds': round(plan.seconds, 3),
         'lower_bound_seconds': None if np.isnan(plan.lower_bound_seconds) else round(plan.lower_bound_seconds, 3),
-        'probability': PROBABILITY,
-        'joints': list(plan.motions[0].joint_names) if plan.motions else [],
-        'motions': [_motion(motion, float(begin), float(end)) for motion, begin, end in zip(plan.motions, begins, plan.ends, strict=True)],
+        **of_joints,
+        'motions': [{'kind': str(motion.kind), 'text': motion.words, 'begins': round(begin, 3), 'ends': round(end, 3),
+                     'seconds': round(motion.seconds, 3), **motion.details}
+                    for motion, begin, end in zip(plan.motions, begins, begins[1:], strict=False)],
         'parameters': {name: {'sd': float(f'{plan.sd[k]:.6g}'), 'tolerance': float(f'{plan.tolerances[k]:.6g}'),
                               'met': name not in plan.missing} for k, name in enumerate(plan.model.param_names) if plan.wanted[k]},
         'missing': list(plan.missing),
         'provenance': provenance,
     }
-
-
-def _motion(motion: PlannedMotion, begin: float, end: float) -> dict[str, Any]:
-    turns = motion.limits.turns
-    units = np.where(turns, 180.0 / np.pi, 1.0)
-    rates = [segment.rate_to for segment in motion.segments if segment.kind == 'spin']
-    found = {'kind': str(motion.kind), 'text': motion.words, 'begins': round(begin, 3), 'ends': round(end, 3),
-             'seconds': round(motion.seconds, 3), 'place_deg_or_m': np.round(motion.place * units, 4).tolist()}
-    if rates:
-        found['rates_deg_s_or_m_s'] = np.round(np.array(rates) * units, 4).tolist()
-    return found
 
 
 def trajectory_to_mapping(points: TrajectoryPoints) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -79,6 +80,14 @@ class PlannedMotion:
     def points(self, position: np.ndarray) -> TrajectoryPoints:
         """Return the trajectory from where the joints rest: positions, velocities and accelerations, at rest at the end."""
         return trajectory(self.joint_names, self.from_position(position))
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """Numbers of the motion for plan.yaml; angles of joints in degrees, named so."""
+        units = np.where(self.limits.turns, 180.0 / np.pi, 1.0)
+        rates = [segment.rate_to for segment in self.segments if segment.kind == 'spin']
+        found = {'place_deg_or_m': np.round(self.place * units, 4).tolist()}
+        return found | ({'rates_deg_s_or_m_s': np.round(np.array(rates) * units, 4).tolist()} if rates else {})
 
     @property
     def words(self) -> str:

@@ -11,9 +11,7 @@ import numpy as np
 from imu_calibration.calibration.hand_step import HandStep, direction_words
 from imu_calibration.core.units import for_people
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import align
-from imu_calibration.planning.hand_plan import HandPlan
 from imu_calibration.planning.planner import Plan
 from imu_calibration.planning.repertoire import MotionKind
 from imu_calibration.report.figures import AXIS_COLOURS, FAINT, GREY, INK, Drawn, draw, log_axis
@@ -102,24 +100,10 @@ def _motion(figure, plan):
     axes.legend(ncols=4, loc='upper center', bbox_to_anchor=(0.5, -0.16))
 
 
-def draw_steps_progress(plan: HandPlan) -> str:
-    """Return the same for the steps of a plan by hand."""
-    return draw('plan-progress', (8.6, 4.2), _fall, np.arange(len(plan.history)), plan.history, plan.param_names, 'poses and turns',
-                label='Predicted standard deviations against steps')
-
-
 def _progress(figure, plan):
+    """Draw a line for each parameter, the worst of all, the tolerance, and the least time."""
+    axes, shown, time, history = figure.subplots(), set(), np.concatenate([[0.0], plan.ends]), plan.history
     names = [name for name, wanted in zip(plan.model.param_names, plan.wanted, strict=True) if wanted]
-    axes = _fall(figure, np.concatenate([[0.0], plan.ends]), plan.history, names, 'time, s')
-    if 0 < plan.lower_bound_seconds < np.inf and not plan.missing:
-        axes.axvline(plan.lower_bound_seconds, color=FAINT, lw=1.2)
-        axes.annotate('least time', (plan.lower_bound_seconds, axes.get_ylim()[1]), (4, -10), textcoords='offset points', color=GREY,
-                      fontsize=8)
-
-
-def _fall(figure, time, history, names, label):
-    """Draw a line for each parameter, the worst of all, and the tolerance; return the axes."""
-    axes, shown = figure.subplots(), set()
     for name, values in zip(names, history.T, strict=True):
         sensor = name.split('.')[0]
         colour = AXIS_COLOURS['x'] if sensor == SENSORS[0] else AXIS_COLOURS['z']
@@ -129,10 +113,13 @@ def _fall(figure, time, history, names, label):
     axes.axhline(1.0, color=FAINT, ls='--', lw=1.2)
     axes.annotate('tolerance', (time[-1], 1.0), (-4, 4), textcoords='offset points', ha='right', color=GREY, fontsize=8)
     log_axis(axes.yaxis)
-    axes.set_xlabel(label)
+    axes.set_xlabel('time, s')
     axes.set_ylabel('sd / tolerance')
     axes.legend(loc='upper right')
-    return axes
+    if 0 < plan.lower_bound_seconds < np.inf and not plan.missing:
+        axes.axvline(plan.lower_bound_seconds, color=FAINT, lw=1.2)
+        axes.annotate('least time', (plan.lower_bound_seconds, axes.get_ylim()[1]), (4, -10), textcoords='offset points', color=GREY,
+                      fontsize=8)
 
 
 SAYS = {MotionKind.POSE: 'rest', MotionKind.RETURN: 'return', MotionKind.SPIN: 'spin', MotionKind.SWING: 'swing',
@@ -142,39 +129,29 @@ SAYS = {MotionKind.POSE: 'rest', MotionKind.RETURN: 'return', MotionKind.SPIN: '
 
 def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
-    count, bound = int(plan.wanted.sum()), plan.lower_bound_seconds
+    by_hand, count, bound = plan.start is None, int(plan.wanted.sum()), plan.lower_bound_seconds
     met = int((plan.sd <= plan.tolerances * (1 + 1e-6))[plan.wanted].sum())
-    tiles = [_tile('time', text(plan.seconds), 's', f'{len(plan.motions)} motions'),
-             _tile('least time', text(bound), 's', 'lower bound for plans of these motions') if np.isfinite(bound) else
-             _tile('least time', 'not worked out', '', ''),
+    tiles = [_tile('time', text(plan.seconds), 's', f'{len(plan.motions)} {plan.noun}'),
              _tile('within tolerance', f'{met} of {count}', '', 'parameters')]
-    sense = _kinds(plan)
+    if not by_hand:
+        tiles.insert(1, _tile('least time', text(bound), 's', 'lower bound for plans of these motions') if np.isfinite(bound) else
+                     _tile('least time', 'not worked out', '', ''))
+    sense = 'do the steps in this order, each by the turn that is named' if by_hand else _kinds(plan)
     if plan.missing:
-        sense = f'out of reach for every motion of these joints within their limits: {", ".join(plan.missing)}'
-    return _page(plan.model, {name: k for k, name in enumerate(plan.model.param_names) if plan.wanted[k]}, plan.sd, plan.tolerances,
-                 word='good' if not plan.missing else 'weak', sense=sense, tiles=tiles, facts=_facts(provenance), motion=draw_motion(plan),
-                 headline=f'{plan.told_apart} separated after {text(plan.seconds)} s' if plan.told_apart and not plan.missing else
-                 f'{met} of {count} parameters within tolerance after {text(plan.seconds)} s', caption=CAPTION, reading=READING,
-                 count='until, s', progress=draw_progress(plan), rows=_rows(plan))
+        sense = f'out of reach {plan.scope}: {", ".join(plan.missing)}'
+    what = plan.told_apart if plan.told_apart and not plan.missing else ''
+    rows = [{'until': str(number) if by_hand else f'{end:.1f}', 'kind': str(motion.kind), 'words': motion.words}
+            for number, (motion, end) in enumerate(zip(plan.motions, plan.ends, strict=True), start=1)]
+    return render('plan.html', title='Plan of a calibration', groups=_groups(plan), word='weak' if plan.missing else 'good', sense=sense,
+                  headline=f'{what} separated after {text(plan.seconds)} s' if what else
+                  f'{met} of {count} parameters within tolerance after {text(plan.seconds)} s', tiles=tiles,
+                  facts=[(str(name).replace('_', ' '), value) for name, value in provenance.items()],
+                  motion=draw_steps(plan.motions) if by_hand else draw_motion(plan), caption=HAND_CAPTION if by_hand else CAPTION,
+                  reading=READING[:1] if by_hand else READING, count='step' if by_hand else 'until, s', progress=draw_progress(plan),
+                  rows=rows)
 
 
-def hand_plan_report(plan: HandPlan, model: SensorModel, provenance: dict[str, Any]) -> str:
-    """Return the report of a plan by hand, as text and pictures."""
-    count, met = len(plan.param_names), len(plan.param_names) - len(plan.missing)
-    rows = [{'until': f'{number}', 'kind': 'turn' if step.is_turn else 'pose', 'words': step.words}
-            for number, step in enumerate(plan.steps, start=1)]
-    sense = f'no pose and no turn by hand brings these within their tolerance: {", ".join(plan.missing)}' if plan.missing else \
-        'do the steps in this order, each by the turn that is named'
-    return _page(model, {name: k for k, name in enumerate(plan.param_names)}, plan.sd, plan.tolerances,
-                 word='good' if not plan.missing else 'weak', sense=sense, facts=_facts(provenance),
-                 tiles=[_tile('time', text(plan.seconds), 's', f'{len(plan.steps)} poses and turns'),
-                        _tile('within tolerance', f'{met} of {count}', '', 'parameters')],
-                 headline=f'{met} of {count} parameters within tolerance after {len(plan.steps)} poses and turns',
-                 motion=draw_steps(plan.steps), reading=READING[:1], count='step',
-                 caption='The IMU as a box, x its longest side, z its thinnest; as it is held at the end of each step.',
-                 progress=draw_steps_progress(plan), rows=rows)
-
-
+HAND_CAPTION = 'The IMU as a box, x its longest side, z its thinnest; as it is held at the end of each step.'
 CAPTION = ('Positions of the joints; the band above shows the kind of motion. Angles of endless joints are drawn within one turn.')
 READING = ('The standard deviations are those that a calibration of this motion will report, from the same columns, windows and noise. The '
            'biases wander according to the grade or the noise file: therefore long rests are rare and returns are frequent.',
@@ -183,16 +160,8 @@ READING = ('The standard deviations are those that a calibration of this motion 
            'is shorter.')
 
 
-def _page(model, places, sd, tolerances, **content):
-    return render('plan.html', title='Plan of a calibration', groups=_groups(model, places, sd, tolerances), **content)
-
-
 def _tile(what, number, unit, note):
     return {'what': what, 'number': number, 'unit': unit, 'before': '', 'note': note}
-
-
-def _facts(provenance):
-    return [(str(what).replace('_', ' '), value) for what, value in provenance.items()]
 
 
 def _kinds(plan):
@@ -200,15 +169,12 @@ def _kinds(plan):
     return ', '.join(f'{count} {SAYS[kind]}{"s" if count > 1 else ""}' for kind, count in counts.items() if count) or 'nothing to do'
 
 
-def _rows(plan):
-    return [{'until': f'{end:.1f}', 'kind': str(motion.kind), 'words': motion.words}
-            for motion, end in zip(plan.motions, plan.ends, strict=True)]
-
-
-def _groups(model, places, sd, tolerances):
+def _groups(plan):
     """Return the predicted standard deviations of the parameters of each effect, in common units."""
+    sd, tolerances = plan.sd, plan.tolerances
+    places = {name: k for k, name in enumerate(plan.model.param_names) if plan.wanted[k]}
     groups = []
-    for effect in model.effects:
+    for effect in plan.model.effects:
         names = [name for name in effect.param_names() if name in places]
         factor, unit = for_people(effect.unit_of(0), effect.sensor)
         rows = [{'name': name, 'component': name.split('.')[-1], 'sd': text(factor * sd[places[name]]),

@@ -24,8 +24,7 @@ from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.kinematics.motion_limits import NOT_CHECKED, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.campaign import make_separator
-from imu_calibration.planning.hand_plan import HandPlan, hand_plan_to_mapping, plan_by_hand
-from imu_calibration.planning.planner import Plan, make_planner, plan_to_mapping, trajectory_to_mapping
+from imu_calibration.planning.planner import Plan, make_planner, plan_by_hand, plan_to_mapping, trajectory_to_mapping
 from imu_calibration.planning.situation import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.report.figures import Drawn
@@ -46,20 +45,20 @@ class Planned:
 
     plan: Plan
     """Motions, predicted standard deviations, time and its lower bound."""
-    table: Table
-    """What moves."""
+    table: Table | None
+    """What moves; None: by hand."""
     provenance: dict[str, Any]
     """Options that it was made with."""
 
     @property
     def exit_code(self) -> int:
         """0 when every parameter reaches its tolerance and every joint has a range or is declared endless, otherwise 3."""
-        return 3 if self.plan.missing or missing_ranges(self.table) else 0
+        return 3 if self.plan.missing or (self.table is not None and missing_ranges(self.table)) else 0
 
     @property
     def notes(self) -> list[str]:
         """Checks and doubts about the limits, a line each."""
-        return [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(self.table))]
+        return [] if self.table is None else [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(self.table))]
 
     @property
     def seconds(self) -> float:
@@ -84,22 +83,22 @@ class Planned:
         return draw_progress(self.plan)
 
     def save(self, folder: str | PathLike, *, report: bool = True, bag: bool = True, storage: str = 'sqlite3') -> None:
-        """Write plan.yaml, trajectory.yaml and, when wanted, report.html and the bag `trajectory` with one message for each motion."""
+        """Write plan.yaml, of joints trajectory.yaml, and, when wanted, report.html and the bag `trajectory` with a message per motion."""
         from msg_adapters.write import write_trajectories
-        place = files.make_folder(folder)
+        place, moves_joints = files.make_folder(folder), self.table is not None and bool(self.plan.motions)
         text = documents.to_text(plan_to_mapping(self.plan, self.provenance))
         page = self.report if report else ''
-        if self.plan.motions and bag:  # first, since it refuses where there is one already
+        if moves_joints and bag:  # first, since it refuses where there is one already
             write_trajectories(place / 'trajectory', self._messages(), storage=storage)
         if report:
             files.write_text(place / 'report.html', page)
-        if self.plan.motions:
+        if moves_joints:
             files.write_text(place / 'trajectory.yaml', documents.to_text(trajectory_to_mapping(self.plan.points)))
         files.write_text(place / 'plan.yaml', text)
 
     def _messages(self):
         from imu_calibration.planning.repertoire import trajectory
-        names, begins = self.plan.motions[0].joint_names, np.concatenate([[0.0], self.plan.ends[:-1]])
+        names, begins = tuple(self.plan.model.joint_names), np.concatenate([[0.0], self.plan.ends[:-1]])
         return [(PLAN_START_NS + round(float(begin) * 1e9), trajectory(names, segments))
                 for begin, segments in zip(begins, self.plan.segments, strict=True) if segments]
 
@@ -192,41 +191,7 @@ def _known(calibration, table, options):
         raise error.named(str(calibration)) from error
 
 
-@dataclass(frozen=True, eq=False)
-class PlannedByHand:
-    """Poses and turns by hand: prints their predicted accuracy, saves plan.yaml and report.html."""
-
-    plan: HandPlan
-    """Steps, predicted standard deviations, time."""
-    model: HandModel
-    """Parameters to determine."""
-    provenance: dict[str, Any]
-    """Options that it was made with."""
-
-    @property
-    def exit_code(self) -> int:
-        """0 when every parameter reaches its tolerance, otherwise 3."""
-        return 3 if self.plan.missing else 0
-
-    @cached_property
-    def report(self) -> str:
-        """The report as one HTML page."""
-        from imu_calibration.report.plan_page import hand_plan_report
-        report('drawing the report')
-        return hand_plan_report(self.plan, self.model.model, self.provenance)
-
-    def save(self, folder: str | PathLike, *, report: bool = True) -> None:
-        """Write plan.yaml and, when wanted, report.html."""
-        place = files.make_folder(folder)
-        if report:
-            files.write_text(place / 'report.html', self.report)
-        files.write_text(place / 'plan.yaml', documents.to_text(hand_plan_to_mapping(self.plan, self.provenance)))
-
-    def __str__(self):
-        return '\n'.join(hand_summary(self.plan))
-
-
-def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: Any) -> PlannedByHand:
+def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: Any) -> Planned:
     """
     Plan the poses and turns of a calibration without a table.
 
@@ -247,16 +212,8 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
     noise = expected_noise(options.noise, grade, imu_rate)
     report('planning')
     found = plan_by_hand(model, tolerances=tolerances_of(model.model, options.tolerances), noise=noise, rate=imu_rate)
-    return PlannedByHand(found, model, {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
-                                         'reference': 'gravity, by hand'})
-
-
-def hand_summary(made: HandPlan) -> list[str]:
-    """Return the predictions of a plan by hand, a line each."""
-    count = len(made.param_names)
-    lines = [f'{len(made.steps)} poses and turns, about {made.seconds:.0f} s; {count - len(made.missing)} of {count} parameters are '
-             'within their tolerance']
-    return lines + ([f'out of reach by hand: {", ".join(made.missing)}'] if made.missing else [])
+    return Planned(found, None, {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
+                                 'reference': 'gravity, by hand'})
 
 
 def _class_of(diagnosis):
@@ -289,9 +246,9 @@ def summary(made: Plan) -> list[str]:
             return [f'{head} separate {made.told_apart}']
         return [head, f'at their assumed sizes, no motion of these joints in that time separates: {", ".join(made.missing)}']
     count, met = int(made.wanted.sum()), int(made.wanted.sum()) - len(made.missing)
-    lines = [f'{len(made.motions)} motions in {made.seconds:.0f} s; {met} of {count} parameters are within their tolerance']
+    lines = [f'{len(made.motions)} {made.noun} in {made.seconds:.0f} s; {met} of {count} parameters are within their tolerance']
     if np.isfinite(made.lower_bound_seconds) and made.lower_bound_seconds > 0 and not made.missing:
         lines.append(f'every plan of these motions with the same probability (95 %) needs at least {made.lower_bound_seconds:.0f} s')
     if made.missing:
-        lines.append(f'outside their tolerance for every motion of these joints within their limits: {", ".join(made.missing)}')
+        lines.append(f'outside their tolerance {made.scope}: {", ".join(made.missing)}')
     return lines
