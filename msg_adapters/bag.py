@@ -1,7 +1,6 @@
 """A recording by path, whatever its storage, and a robot description in it."""
 
 import bz2
-from collections import defaultdict
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from msg_adapters.joint_state import JOINT_STATE_TYPE
 from msg_adapters.layout import Packed, clean_name
 from msg_adapters.mcap_records import LARGEST_CHUNK, decompress
 from msg_adapters.rosbag2 import Rosbag2
-from msg_adapters.storage import Arrived
+from msg_adapters.storage import RawMessages
 from msg_adapters.storages import BagSource, suffixes
 
 DESCRIPTION_TOPIC = '/robot_description'
@@ -74,11 +73,10 @@ def _messages(path, imu_topic, topic, message_type, read: Callable[[Any], Sample
     with open_recording(path, imu_topic, want_joints=False, want_temperature=False) as recording:
         if recording.source.types.get(topic) == message_type:
             deserialize = recording.deserializer(message_type)
-            for found in recording.source.stretches([topic]):
-                packed = found[topic].packed
-                for k in range(len(packed)):
+            for raw in recording.source.stretches([topic]):
+                for k in range(len(raw.packed)):
                     with suppress(Exception):   # rosbags raises many kinds on broken bytes
-                        yield read(deserialize(packed.message(k)))
+                        yield read(deserialize(raw.packed.message(k)))
 
 
 TOPIC_KEYS = {IMU_TYPE: 'imu_topic', JOINT_STATE_TYPE: 'joint_topic', TEMPERATURE_TYPE: 'temperature_topic'}
@@ -200,9 +198,9 @@ class Recording:
         """
         decoders = self._decoders(joint_names, self.frame_id)
         parts, n_samples = {}, 0
-        for stretch in self.source.stretches(list(decoders)):
-            for topic, arrived in stretch.items():
-                samples = decoders[topic].decode(*arrived)
+        for raw in self.source.stretches(list(decoders)):
+            for number, decoder in enumerate(decoders.values()):
+                samples = decoder.decode(*raw.of(number))
                 if samples is not None:
                     parts.setdefault(type(samples), []).append(samples)
                     n_samples += len(samples)
@@ -233,10 +231,8 @@ class Recording:
     def frames(self) -> list[str]:
         """Return the frames of the first stretch of the Imu topic, in order of name; [] without messages."""
         decoder = self._decoders(None, '')[self.imu_topic]   # with a chosen frame, several frames are no error
-        for stretch in self.source.stretches([self.imu_topic]):
-            if self.imu_topic in stretch:
-                decoder.decode(*stretch[self.imu_topic])
-                break
+        if (raw := next(iter(self.source.stretches([self.imu_topic])), None)) is not None:
+            decoder.decode(*raw.of(0))
         return sorted(frame for frame, count in decoder.choice.counts.items() if count >= OTHER_FRAME)
 
     def deserializer(self, message_type: str) -> Callable:
@@ -358,10 +354,10 @@ class Ros1File:
         """Time between the first and the last message by the clock of the recorder."""
         return max(self.reader.end_time - self.reader.start_time - 1, 0) if self.reader.message_count else 0
 
-    def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Packed]]:
-        """Yield dicts topic -> Arrived in file order; lost messages of the file are counted in `lost`."""
+    def stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
+        """Yield RawMessages of the topics in file order; lost messages of the file are counted in `lost`."""
         connections = [c for c in self.reader.connections if self.topics[c.id] in topics]
-        pending, n_pending, n_read = defaultdict(list), 0, 0
+        pending, n_read = [], 0
         expected = sum(c.msgcount for c in connections)
         messages = self.reader.messages(connections) if connections else iter(())
         while True:
@@ -372,13 +368,13 @@ class Ros1File:
             except Exception as error:   # rosbags raises various errors on damaged files
                 self.lost[f'messages after damage ({error})'] = max(expected - n_read, 1)
                 break
-            pending[self.topics[connection.id]].append((bytes(data), received_ns))
-            n_pending, n_read = n_pending + 1, n_read + 1
-            if n_pending == STRETCH_MESSAGES:
-                yield _arrived(pending)
-                pending, n_pending = defaultdict(list), 0
+            pending.append((topics.index(self.topics[connection.id]), received_ns, bytes(data)))
+            n_read += 1
+            if len(pending) == STRETCH_MESSAGES:
+                yield _raw(pending)
+                pending = []
         if pending:
-            yield _arrived(pending)
+            yield _raw(pending)
 
     def close(self) -> None:
         """Close the file."""
@@ -393,10 +389,7 @@ def _bounded(chunk: Any) -> Any:
     return chunk if compression is None else chunk._replace(decompressor=lambda data: decompress(compression, data, LARGEST_CHUNK))
 
 
-def _arrived(pending):
-    """Return topic -> Arrived from topic -> [(message, receive time)]."""
-    found = {}
-    for topic, entries in pending.items():
-        messages, times = zip(*entries, strict=True)
-        found[topic] = Arrived(Packed.join(list(messages)), partial(np.array, times, dtype=np.int64))
-    return found
+def _raw(pending):
+    """Return the RawMessages of a list of (index of the topic, receive time, message)."""
+    numbers, times, messages = zip(*pending, strict=True)
+    return RawMessages(np.array(numbers), partial(np.array, times, dtype=np.int64), Packed.join(messages))

@@ -66,7 +66,7 @@ def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike
         with BagWriter(destination, bag.storage) as writer:
             ids = np.array([writer.add_topic(name, bag.definition(name), bag.qos(name)) for name in topics])
             corrected_id = writer.add_topic(corrected_topic, standard_definition(IMU_TYPE))
-            for raw in bag.raw_stretches(topics):
+            for raw in bag.stretches(topics):
                 measured = np.flatnonzero(raw.topic == topics.index(recording.imu_topic))
                 _write(writer, ids[raw.topic], raw, measured, corrected_id, patch)
         choice.check()
@@ -90,11 +90,12 @@ def _check(recording, corrected_topic):
 
 def _write(writer, topic_ids, raw, measured, corrected_id, patch):
     """Write one stretch, every corrected message after the measured one."""
-    done, corrected = patch(raw.packed.select(measured), raw.received_ns[measured]) if len(measured) else (measured, [])
+    received_ns = raw.received_ns()
+    done, corrected = patch(raw.packed.select(measured), received_ns[measured]) if len(measured) else (measured, [])
     measured = measured[done]
     order = np.argsort(np.concatenate([np.arange(len(raw.packed)), measured]), kind='stable')
     topic_ids = np.concatenate([topic_ids, np.full(len(measured), corrected_id)])
-    received_ns = np.concatenate([raw.received_ns, raw.received_ns[measured]])
+    received_ns = np.concatenate([received_ns, received_ns[measured]])
     writer.write(topic_ids[order], received_ns[order], Packed.chain([raw.packed, *corrected]).select(order))
 
 

@@ -14,6 +14,7 @@ from imu_calibration.core.errors import InputError, shortened
 from msg_adapters.definitions import STANDARD_TYPES, TypeDefinition, is_standard, standard_definition
 from msg_adapters.layout import clean_name
 from msg_adapters.mcap_records import decompress_file, decompress_message
+from msg_adapters.storage import RawMessages
 from msg_adapters.storages import STORAGES, suffixes
 
 QOS_POLICIES = ('history', 'reliability', 'durability', 'liveliness')
@@ -110,23 +111,15 @@ class Rosbag2:
         """Return the QoS profiles of a topic's publishers that the metadata contain."""
         return spelled_out(self._entry(topic).get('offered_qos_profiles', []))
 
-    def stretches(self, topics: Sequence[str]) -> Iterator:
-        """Yield dicts topic -> Arrived in file order."""
-        return self._through(topics, lambda file: file.stretches(topics), lambda found: sum(len(part.packed) for part in found.values()))
-
-    def raw_stretches(self, topics: Sequence[str]) -> Iterator:
-        """Yield RawMessages of the topics in file order."""
-        return self._through(topics, lambda file: file.raw_stretches(topics), lambda raw: len(raw.topic))
-
-    def _through(self, topics, read, count):
-        """Read the files one after the other; count the messages in the metadata that damaged files lack."""
+    def stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
+        """Yield RawMessages of the topics, file by file; count the messages in the metadata that damaged files lack."""
         n_read = 0
         for file in self.files:
             file.lost.clear()
             try:
-                for stretch in read(file):
-                    n_read += count(stretch)
-                    yield stretch
+                for raw in file.stretches(topics):
+                    n_read += len(raw.topic)
+                    yield raw
             except Exception as error:   # readers raise various errors on hostile or damaged files
                 file.lost[f'rest of {file.path.name} after damage ({shortened(f"{type(error).__name__}: {error}", 100)})'] = 1
         announced = sum(self._announced().get(topic, 0) for topic in topics)

@@ -26,24 +26,20 @@ class Stretch(NamedTuple):
     """Index array -> receive times, int64."""
 
 
-class Arrived(NamedTuple):
-    """Consecutive messages of one topic, in file order."""
-
-    packed: Packed
-    """The messages."""
-    received_ns: Callable
-    """Called without arguments: receive times, int64, shape (n,); rarely needed."""
-
-
 class RawMessages(NamedTuple):
     """Consecutive messages of some topics, in file order."""
 
     topic: np.ndarray
     """Index into the requested topics, shape (n,)."""
-    received_ns: np.ndarray
-    """Receive times, int64, shape (n,)."""
+    received_ns: Callable[[], np.ndarray]
+    """Called without arguments: receive times, int64, shape (n,); rarely needed."""
     packed: Packed
     """The messages."""
+
+    def of(self, number: int) -> tuple[Packed, Callable[[], np.ndarray]]:
+        """Return the messages of one of the requested topics, and a function that returns their receive times."""
+        mine = np.flatnonzero(self.topic == number)
+        return self.packed.select(mine), lambda: self.received_ns()[mine]
 
 
 class StorageFile:
@@ -67,20 +63,8 @@ class StorageFile:
         """Yield the Stretches of the file that may hold messages of the topics."""
         raise NotImplementedError
 
-    def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Arrived]]:
-        """Yield dicts topic -> Arrived in file order; lost messages of the file are counted in `lost`."""
-        for stretch in self._stretches(topics):
-            found = {}
-            for topic in topics:
-                mine = np.flatnonzero(is_any(stretch.topic_ids, self.topic_ids.get(topic, [])))
-                if len(mine):
-                    mine, packed = self._take(stretch, mine)
-                    found[topic] = Arrived(packed, partial(stretch.received_ns, mine))
-            if found:
-                yield found
-
-    def raw_stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
-        """Yield RawMessages of the topics in file order."""
+    def stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
+        """Yield RawMessages of the topics in file order; lost messages of the file are counted in `lost`."""
         for stretch in self._stretches(topics):
             code = np.full(len(stretch.topic_ids), -1)
             for number, topic in enumerate(topics):
@@ -88,7 +72,7 @@ class StorageFile:
             mine = np.flatnonzero(code >= 0)
             if len(mine):
                 mine, packed = self._take(stretch, mine)
-                yield RawMessages(code[mine], stretch.received_ns(mine), packed)
+                yield RawMessages(code[mine], partial(stretch.received_ns, mine), packed)
 
     def _take(self, stretch, mine):
         mine, packed = stretch.pack(mine)

@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol
 
 from msg_adapters.mcap_file import McapFile, McapWriter
 from msg_adapters.sqlite_file import SqliteFile, SqliteWriter
-from msg_adapters.storage import Arrived
+from msg_adapters.storage import RawMessages
 
 
 class BagSource(Protocol):
@@ -28,8 +28,8 @@ class BagSource(Protocol):
     def duration_ns(self) -> int:
         """Time between the first and the last message by the clock of the recorder."""
 
-    def stretches(self, topics: Sequence[str]) -> Iterator[dict[str, Arrived]]:
-        """Yield dicts topic -> Arrived in file order."""
+    def stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
+        """Yield RawMessages of the topics in file order."""
 
     def close(self) -> None:
         """Close the files."""

@@ -48,7 +48,7 @@ class BagPlayerNode(Node):
         self._topics = self._choose()
         announce(self, [], [*self._topics, *['/clock'] * self.settings.clock], note=f'from the bag {files.user_path(self.settings.bag)}')
         self._players = [self._publisher(name) for name in self._topics]
-        first = next((int(raw.received_ns[0]) for raw in self._bag.raw_stretches(self._topics)), 0)
+        first = next((int(raw.received_ns()[0]) for raw in self._bag.stretches(self._topics)), 0)
         pace = Pace(self.settings.rate, 100.0 if self.settings.clock else 0.0, self.settings.wait_for_subscribers)
         self._playback = Playback(self, self._players, self._batches(first), pace=pace, clock_start_ns=first, awaited=self._players,
                                   ended='played {} messages', ends_node=self.settings.stop_at_end)
@@ -106,8 +106,8 @@ class BagPlayerNode(Node):
         offset = 0.0
         while True:
             until = offset
-            for raw in self._bag.raw_stretches(self._topics):
-                due = np.maximum.accumulate(np.maximum((raw.received_ns - first_ns) * 1e-9 + offset, until))
+            for raw in self._bag.stretches(self._topics):
+                due = np.maximum.accumulate(np.maximum((raw.received_ns() - first_ns) * 1e-9 + offset, until))
                 until = float(due[-1])
                 yield Batch(due, [self._players[k] for k in raw.topic], raw.packed.views(), until)
             offset = until + PAUSE
