@@ -12,7 +12,7 @@ from imu_calibration.document.trust import Uncorrected, judged_from_of, uncorrec
 from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular_of_band
 from imu_calibration.estimation.solution import HELD
-from imu_calibration.kinematics.strapdown import integrate_turn
+from imu_calibration.kinematics.strapdown import total_rotation
 from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, TurnData, between_middles
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -161,6 +161,5 @@ def turn_error(poses: Poses, turn: TurnData, rates: np.ndarray, *, up: np.ndarra
 
     """
     known = np.isfinite(rates).all(axis=1)
-    mat_ji = integrate_turn(turn.time[known], rates[known], bias=np.zeros(3), matrix=np.eye(3)).mat_ji
-    rotated, last = between_middles(poses, turn, mat_ji) @ up[turn.first], up[turn.last]
+    rotated, last = between_middles(poses, turn, total_rotation(turn.time[known], rates[known])) @ up[turn.first], up[turn.last]
     return float(np.arctan2(np.linalg.norm(np.cross(rotated, last)), rotated @ last))

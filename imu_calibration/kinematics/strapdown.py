@@ -44,7 +44,7 @@ def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndar
 
     The rotation vector of each step is the Magnus series to second order, ``h/2 (w0 + w1) - h^2/12 (w1' - w0') + h^2/12 w0 x w1``
     with slopes by central differences: fourth order in the step, third at the ends of the stretch. The steps are multiplied by
-    a prefix product, log2(n) passes over the samples.
+    a prefix product. All arrays have the samples along their last axis.
 
     Parameters
     ----------
@@ -63,36 +63,41 @@ def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndar
 
     """
     inverse = np.linalg.inv(matrix)
-    centred = rate_measured - bias if further is None else rate_measured - bias - further[0]
-    rate = centred @ inverse.T
-    step, first, second, slopes = np.diff(time), rate[:-1], rate[1:], _slope_weights(time)
+    centred = (rate_measured - bias if further is None else rate_measured - bias - further[0]).T.copy()
+    rate, step, slopes = inverse @ centred, np.diff(time), _slope_weights(time)
     vectors = _rotation_vectors(rate, step, slopes)
-    mat_ki = Rotation.from_quat(_prefix_product(vectors).T).inv().as_matrix()
-    to_last = mat_ki[-1] @ np.swapaxes(mat_ki, 1, 2)
-    gain = to_last @ _right_jacobian(vectors)
-    weight = _per_sample(gain, step, first, second, slopes)
-    by_inverse = np.einsum('mir,mc->irc', weight, centred)
+    mat_ik = Rotation.from_quat(_prefix_product(vectors).T).as_matrix()
+    mat_ji = mat_ik[-1].T.copy()
+    to_last = (mat_ji @ mat_ik.transpose(1, 2, 0).reshape(3, -1)).reshape(3, 3, -1)
+    weight = _per_sample(_times_jacobian(to_last, vectors), step, rate, slopes)
+    by_inverse = (weight.reshape(9, -1) @ centred.T).reshape(3, 3, 3)
     by_matrix = -np.einsum('irc,rp,qc->ipq', by_inverse, inverse, inverse)
-    by_further = np.zeros((3, 0)) if further is None else -np.einsum('mij,mjp->ip', weight @ inverse, further[1])
-    path = float(np.sum(0.5 * step * np.linalg.norm(first + second, axis=1)))
-    integral = 0.5 * np.sum(step[:, None] * (centred[:-1] + centred[1:]), axis=0)
-    return Turn(mat_ki[-1], -weight.sum(0) @ inverse, by_matrix, by_further, integral, path, float(time[-1] - time[0]))
+    by_reading = inverse.T @ weight
+    by_further = np.zeros((3, 0)) if further is None else -np.tensordot(by_reading, further[1], ((1, 2), (1, 0)))
+    path = float(np.sum(0.5 * step * np.linalg.norm(rate[:, :-1] + rate[:, 1:], axis=0)))
+    integral = 0.5 * (centred[:, :-1] + centred[:, 1:]) @ step
+    return Turn(mat_ji, -by_reading.sum(axis=2), by_matrix, by_further, integral, path, float(time[-1] - time[0]))
 
 
 def total_rotation(time: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Return `Turn.mat_ji` of true rates, rad/s, shape (n, 3), without the derivatives, which take most of the time."""
-    vectors = _rotation_vectors(rate, np.diff(time), _slope_weights(time))
+    vectors = _rotation_vectors(rate.T.copy(), np.diff(time), _slope_weights(time))
     return Rotation.from_quat(_prefix_product(vectors)[:, -1]).inv().as_matrix()
 
 
 def _rotation_vectors(rate, step, slopes):
-    """Return the rotation vector of each step (`integrate_turn`), shape (n - 1, 3)."""
-    first, second = rate[:-1], rate[1:]
-    slope = slopes[1][:, None] * rate
-    slope[1:] += slopes[0][1:, None] * first
-    slope[:-1] += slopes[2][:-1, None] * second
-    commutator = np.cross(first, second) - np.diff(slope, axis=0)
-    return 0.5 * step[:, None] * (first + second) + MAGNUS_SECOND * (step**2)[:, None] * commutator
+    """Return the rotation vector of each step (`integrate_turn`), shape (3, n - 1)."""
+    first, second = rate[:, :-1], rate[:, 1:]
+    slope = slopes[1] * rate
+    slope[:, 1:] += slopes[0][1:] * first
+    slope[:, :-1] += slopes[2][:-1] * second
+    return 0.5 * step * (first + second) + MAGNUS_SECOND * step**2 * (_cross(first, second) - np.diff(slope))
+
+
+def _cross(left, right):
+    """Return the cross products of vectors along the last axis but one, shapes (..., 3, n) and (3, n)."""
+    (a, b, c), (x, y, z) = np.moveaxis(left, -2, 0), right
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-2)
 
 
 def small_rotation(vector: np.ndarray) -> np.ndarray:
@@ -112,18 +117,22 @@ def _slope_weights(time):
     return weights
 
 
-def _per_sample(gain, step, first, second, slopes):
-    """Return H with ``psi = sum_m H_m @ delta rate_m``: each sample ends one step, begins the next, and enters its neighbours' slopes."""
-    half, square = 0.5 * step[:, None, None] * np.eye(3), MAGNUS_SECOND * (step**2)[:, None, None]
-    weight = np.zeros((len(step) + 1, 3, 3))
-    weight[:-1] += gain @ (half - square * skew(second))
-    weight[1:] += gain @ (half + square * skew(first))
-    by_slope = np.zeros_like(weight)
-    by_slope[:-1] += gain * square
-    by_slope[1:] -= gain * square
-    weight += slopes[1][:, None, None] * by_slope
-    weight[:-1] += slopes[0][1:, None, None] * by_slope[1:]
-    weight[1:] += slopes[2][:-1, None, None] * by_slope[:-1]
+def _per_sample(gain, step, rate, slopes):
+    """
+    Return H with ``psi = sum_m H_m @ delta rate_m``, shape (3, 3, n).
+
+    Each sample ends one step, begins the next, and enters its neighbours' slopes. The rows of `gain`, shape (3, 3, n - 1), are multiplied
+    from the right by a cross-product matrix: ``r^T [w x] = (r x w)^T``.
+    """
+    half, by_vector = 0.5 * step * gain, MAGNUS_SECOND * step**2 * gain
+    weight, by_slope = np.zeros((2, 3, 3, len(step) + 1))
+    weight[..., :-1] = half - _cross(by_vector, rate[:, 1:])
+    weight[..., 1:] += half + _cross(by_vector, rate[:, :-1])
+    by_slope[..., :-1] = by_vector
+    by_slope[..., 1:] -= by_vector
+    weight += slopes[1] * by_slope
+    weight[..., :-1] += slopes[0][1:] * by_slope[..., 1:]
+    weight[..., 1:] += slopes[2][:-1] * by_slope[..., :-1]
     return weight
 
 
@@ -134,23 +143,30 @@ def _multiply(left, right):
 
 
 def _prefix_product(vectors):
-    """Return q_0, q_0 q_1, q_0 q_1 q_2, ... of rotation vectors, rows x, y, z, w, shape (4, n): doubling the reach in every pass."""
-    product, reach = np.ascontiguousarray(Rotation.from_rotvec(vectors).as_quat().T), 1
-    while reach < product.shape[1]:
-        product[:, reach:] = _multiply(product[:, :-reach], product[:, reach:])
-        reach *= 2
+    """Return q_0, q_0 q_1, q_0 q_1 q_2, ... of rotation vectors, shape (3, n), as rows x, y, z, w, shape (4, n)."""
+    return _running_quaternion(np.ascontiguousarray(Rotation.from_rotvec(vectors.T).as_quat().T))
+
+
+def _running_quaternion(factors):
+    """Return the products of all factors up to each, shape (4, n): those of the pairs, then between the pairs; 2 n multiplications."""
+    if factors.shape[1] < 2:
+        return factors
+    pairs = _running_quaternion(_multiply(factors[:, :-1:2], factors[:, 1::2]))
+    product = factors.copy()
+    product[:, 1::2] = pairs
+    product[:, 2::2] = _multiply(pairs[:, :(factors.shape[1] - 1) // 2], factors[:, 2::2])
     return product
 
 
-def _right_jacobian(vectors):
-    """Return J with ``exp(v + d) = exp(v) exp(J d)`` to first order, shape (n, 3, 3)."""
-    angle = np.linalg.norm(vectors, axis=1)
+def _times_jacobian(rows, vectors):
+    """Return ``rows J`` with ``exp(v + d) = exp(v) exp(J d)`` to first order, ``J = 1 - one [v x] + two [v x]^2``, shape (3, 3, n)."""
+    angle = np.linalg.norm(vectors, axis=0)
     small = angle < 1e-3
     safe = np.where(small, 1.0, angle)
     one = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
     two = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    cross = skew(vectors)
-    return np.eye(3) - one[:, None, None] * cross + two[:, None, None] * (cross @ cross)
+    across = _cross(rows, vectors)
+    return rows - one * across + two * _cross(across, vectors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +226,7 @@ def integrate_attitude(time: np.ndarray, rate_s: np.ndarray, mat_ns0: np.ndarray
     step = np.diff(time)[:, None]
     turns = 0.5 * (rate_s[1:] + rate_s[:-1]) * step + np.cross(rate_s[:-1], rate_s[1:]) * step**2 / 12
     start = np.eye(3) if mat_ns0 is None else np.asarray(mat_ns0, float)
-    mat_is = _running_product(np.concatenate([start[None], Rotation.from_rotvec(turns).as_matrix()]))
+    mat_is = np.concatenate([start[None], start @ Rotation.from_quat(_prefix_product(turns.T).T).as_matrix()])
     if not np.any(earth_rate_n):
         return mat_is
     return Rotation.from_rotvec(-np.multiply.outer(time - time[0], np.asarray(earth_rate_n, float))).as_matrix() @ mat_is
@@ -330,16 +346,6 @@ def _checked(time, rate_s):
         raise InputError(f'rates must have shape ({len(time)}, 3) at increasing times, got {rate_s.shape}; sort the samples',
                          code='shape_and_times')
     return time, rate_s
-
-
-def _running_product(matrices):
-    """Return M0, M0 M1, M0 M1 M2 ... in log2(n) array products."""
-    product = np.array(matrices)
-    shift = 1
-    while shift < len(product):
-        product[shift:] = product[:-shift] @ product[shift:]
-        shift *= 2
-    return product
 
 
 def _running_integral(time, values):
