@@ -197,16 +197,17 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
             scatter = [solved(trial, poses, turns)[0].scatter.variance[SENSORS.index(effect.sensor)] for trial in trials]
             model = trials[int(np.argmin(scatter))]
     for _ in range(MAX_HAND_PASSES):
-        found, error = solved(model, poses, turns)
+        found, error, integrated = solved(model, poses, turns)
+        integrated = {} if model.model.relinearised else integrated   # the columns below are computed at the estimate
         settled, model = _settled(model, found), model.at(found.state.values)
-        poses, turns, out = without_outliers(model, found, poses=poses, turns=turns)
+        poses, turns, out = without_outliers(model, found, poses=poses, turns=turns, integrated=integrated)
         left |= {f'outlying {kind}': left.get(f'outlying {kind}', 0) + count for kind, count in out.items()}
         if settled and not out:
             break
     movements = bias_movements(model, found.state.values, poses)
     if 'accelerometer' in movements:
         poses = without_movement(poses, movements)
-        found, error = solved(model, poses, turns)
+        found, error, _ = solved(model, poses, turns)
     terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
     used, poses = poses, data.poses   # the result has all poses unchanged, also excluded and drifting ones
     goals = tolerances_of(model.model, options.tolerances)

@@ -20,9 +20,9 @@ from imu_calibration.references.gravity.turns import missed_angle
 
 
 def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float,
-                fallback: np.ndarray) -> tuple[RowEstimate, ModelError]:
+                fallback: np.ndarray) -> tuple[RowEstimate, ModelError, dict]:
     """
-    Return the estimate of all parameters from poses and turns, and the model error in its covariance.
+    Return the estimate of all parameters from poses and turns, the model error in its covariance, and the turns integrated there.
 
     Parameters
     ----------
@@ -37,10 +37,11 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
 
     """
     found = estimate_rows(GravityRows(model, poses, turns), first_state(model, poses), fallback=fallback)
-    error, values = _model_error(GravityRows(model, poses, turns), found), found.state.values
+    reference, values = GravityRows(model, poses, turns), found.state.values
+    error = _model_error(reference, found)
     terms = {**found.terms, **error.terms(total(found.terms)), GRAVITY: _of_gravity(model, values, gravity_sd / model.gravity),
              UNMODELLED_EARTH_RATE: _of_earth(model, found.state, poses, found.free)}
-    return replace(found, terms=terms), error
+    return replace(found, terms=terms), error, reference.memory
 
 
 def _model_error(reference, found):
@@ -112,13 +113,14 @@ def possible_turns(model: HandModel, state: State, poses: Poses, *, turns: Seque
     return kept, len(turns) - len(kept)
 
 
-def without_outliers(model: HandModel, found: RowEstimate, *, poses: Poses, turns: list[TurnData]) -> tuple[Poses, list[TurnData], dict]:
+def without_outliers(model: HandModel, found: RowEstimate, *, poses: Poses, turns: list[TurnData],
+                     integrated: dict | None = None) -> tuple[Poses, list[TurnData], dict]:
     """
     Return (poses, turns, {kind: number}) without outliers: leave-one-out F tests per kind, with Bonferroni correction.
 
-    Excluded poses keep their place, with negligible weight.
+    Excluded poses keep their place, with negligible weight. `integrated`: the turns at the estimate, from `solve_joint`.
     """
-    rows = GravityRows(model, poses, turns).linearise(found.state)
+    rows = GravityRows(model, poses, turns, integrated or {}).linearise(found.state)
     rest, leverage = _whitened(rows, found)
     left, first, of_turn = {}, rows.group[:, 0], {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None}
     for kind in range(len(COMPONENTS)):

@@ -29,6 +29,8 @@ MAX_TURN_GAP = 0.1
 """A turn with a longer hole in it is not used, s; never below five periods."""
 KNOWN_TURN_SD = 0.017
 """Accuracy of the angle and of the axis of full turns made by hand, rad."""
+BLOCK = 16384
+"""Samples whose interpolation errors are computed together: the copies of a long recording would be large."""
 SUMMIT = 3
 """Neighbours in one coarse step at the top of a smooth turn."""
 
@@ -123,17 +125,28 @@ def sample_times(imu: ImuSamples) -> np.ndarray:
     readings interpolate better from their neighbours at the stamps, as with a driver that polls the sensor at uneven times.
     """
     stamps = rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
-    even, period = stamps.copy(), float(np.median(np.diff(stamps)))
-    step = np.diff(stamps) / period
-    count = np.where((step > MAX_REGULAR_STEP) & (np.abs(step - np.rint(step)) <= WHOLE_STEP_SHARE), np.rint(step), 1.0)
-    number, edges = np.concatenate([[0.0], np.cumsum(count)]), np.flatnonzero(step > MOST_LOST + MAX_REGULAR_STEP) + 1
-    for part in np.split(np.arange(len(stamps)), edges):
-        if len(part) >= 2 * LAG:
-            lines = (_clock_line(each, stamps[part], max(1, int(period * len(part) / LINE))) for each in (number[part], part))
-            line = min(lines, key=lambda line: np.sum((stamps[part] - line)**2))   # long steps of a rebuilt clock need not be lost samples
-            late = np.array([piece.mean() for piece in np.array_split(stamps[part] - line, len(part) // LAG)])
-            even[part] = line if np.abs(late).max() < 0.6 * period else even[part]   # otherwise samples were lost unnoticed
+    even, step = stamps.copy(), np.diff(stamps)
+    period = float(np.median(step))
+    edges = np.flatnonzero(step / period > MOST_LOST + MAX_REGULAR_STEP) + 1
+    del step   # a long recording is large
+    for start, stop in zip([0, *edges], [*edges, len(stamps)]):
+        if stop - start >= 2 * LAG:
+            even[start:stop] = _clock_times(stamps[start:stop], period)
     return even if np.all(np.diff(even) > 0) and _roughness(even, imu.rate_s) <= UNDECIDED * _roughness(stamps, imu.rate_s) else stamps
+
+
+def _clock_times(stamps, period):
+    """Return the times of the clock of one stretch, or its stamps where samples were lost unnoticed."""
+    step, numbers = np.diff(stamps) / period, [np.arange(float(len(stamps)))]
+    lost = (step > MAX_REGULAR_STEP) & (np.abs(step - np.rint(step)) <= WHOLE_STEP_SHARE)
+    if lost.any():   # long steps of a rebuilt clock need not be lost samples
+        numbers.insert(0, np.concatenate([[0.0], np.cumsum(np.where(lost, np.rint(step), 1.0))]))
+    lines = (_clock_line(number, stamps, max(1, int(period * len(stamps) / LINE))) for number in numbers)
+    line = min(lines, key=lambda line: np.sum((stamps - line)**2))
+    part = np.arange(len(stamps) // LAG)
+    size, longer = divmod(len(stamps), len(part))
+    late = np.add.reduceat(stamps - line, part * size + np.minimum(part, longer)) / (size + (part < longer))
+    return line if np.abs(late).max() < 0.6 * period else stamps
 
 
 def _clock_line(number, time, pieces):
@@ -144,8 +157,12 @@ def _clock_line(number, time, pieces):
 
 def _roughness(time, rate):
     """Return the sum of squared errors of linear interpolation between the two neighbours of each reading."""
-    share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
-    return float(sum(np.sum((own[1:-1] - (1 - share) * own[:-2] - share * own[2:])**2) for own in rate.T))
+    total = 0.0
+    for start in range(0, len(time) - 2, BLOCK):
+        some, own = time[start:start + BLOCK + 2], rate[start:start + BLOCK + 2].T
+        share = (some[1:-1] - some[:-2]) / (some[2:] - some[:-2])
+        total += float(np.sum((own[:, 1:-1] - (1 - share) * own[:, :-2] - share * own[:, 2:])**2))
+    return total
 
 
 def rising(time: np.ndarray) -> np.ndarray:
