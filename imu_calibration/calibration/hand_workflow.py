@@ -118,7 +118,8 @@ class HandRecording:
         """Data of the recording for the document, without parameters."""
         imu, warm = self.imu, self.temperature_c
         return Gathered(counts=self.counts, frame_id=imu.frame_id, first_stamp_ns=int(imu.stamp_ns[0]), last_stamp_ns=int(imu.stamp_ns[-1]),
-                        largest_rate=float(np.sqrt((imu.rate_s**2).sum(axis=1).max())), largest_force=float(np.abs(imu.force_s).max()),
+                        largest_rate=float(np.sqrt(np.einsum('ij,ij->i', imu.rate_s, imu.rate_s).max())),
+                        largest_force=float(max(imu.force_s.max(), -imu.force_s.min())),
                         temperature_c=None if warm is None else (float(warm.min()), float(warm.max())))
 
 

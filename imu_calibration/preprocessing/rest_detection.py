@@ -177,13 +177,12 @@ class _CellSums:
     """Sums over cells of samples, from which variances over any span of cells follow."""
 
     def __init__(self, values, edges):
-        sums, squares = [], np.zeros(len(values))
+        sums, squares = [], np.zeros(len(edges) - 1)
         for axis in values.T:   # one at a time: a long recording is large
-            row = np.ascontiguousarray(axis)
-            centred = row - row.mean()
+            centred = axis - axis.mean()
             sums.append(np.add.reduceat(centred, edges[:-1]))
-            squares += np.square(centred, out=centred)
-        self._count, self._sum, self._square = edges, _running(np.array(sums)), _running(np.add.reduceat(squares, edges[:-1]))
+            squares += np.add.reduceat(np.square(centred, out=centred), edges[:-1])
+        self._count, self._sum, self._square = edges, _running(np.array(sums)), _running(squares)
 
     def variance(self, width):
         """Return the variance over `width` cells from each cell on, axes added."""

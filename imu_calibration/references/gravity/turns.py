@@ -30,7 +30,7 @@ MAX_TURN_GAP = 0.1
 KNOWN_TURN_SD = 0.017
 """Accuracy of the angle and of the axis of full turns made by hand, rad."""
 BLOCK = 16384
-"""Samples whose interpolation errors are computed together: the copies of a long recording would be large."""
+"""Samples that are processed together: copies of a long recording are large."""
 SUMMIT = 3
 """Neighbours in one coarse step at the top of a smooth turn."""
 
@@ -84,7 +84,7 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
 
 def _at_end(signed, axes, fresh):
     """Return the samples at the largest value of ``signed(axes)``, shape (m, n), when that is the end of a range."""
-    some = np.sort(np.concatenate([_largest(signed(axis[fresh])) for axis in axes]))[-MAX_RANGE_READINGS:]   # one copy of an axis at a time
+    some = np.sort(np.concatenate([_largest(signed, axis, fresh) for axis in axes]))[-MAX_RANGE_READINGS:]
     step = np.diff(some)
     step = step[step > 1e-9 * np.abs(some[-1])].min(initial=np.inf)
     margin = 1.5 * step if np.isfinite(step) and len(axes) > 1 else 0.5 * step   # two's complement: one end is larger by a step
@@ -100,8 +100,16 @@ def _at_end(signed, axes, fresh):
     return at if number >= max(2, CROWDED * chance) else np.zeros(len(fresh), bool)
 
 
-def _largest(values):
-    return np.partition(values, -MAX_RANGE_READINGS)[-MAX_RANGE_READINGS:] if len(values) > MAX_RANGE_READINGS else values
+def _largest(signed, axis, fresh):
+    """Return the largest values of ``signed(axis[fresh])``, block by block."""
+    largest, least = np.zeros(0), -np.inf
+    for start in range(0, len(axis), BLOCK):
+        values = signed(axis[start:start + BLOCK])
+        largest = np.append(largest, values[(values > least) & fresh[start:start + BLOCK]])
+        if len(largest) > MAX_RANGE_READINGS:
+            largest = np.partition(largest, -MAX_RANGE_READINGS)[-MAX_RANGE_READINGS:]
+            least = largest[0]
+    return largest
 
 
 def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, *, poses: Poses,
