@@ -318,14 +318,9 @@ def lines(figures: NoiseFigures) -> list[str]:
         found.append('slow noise (bias instability, Gauss–Markov, random walk): the intervals are valid for this recording; '
                      'values of a second recording can lie outside')
     longest = _longest(figures)
-    return [*found, *([longest] if longest else []), _metres(figures)]
-
-
-def _metres(figures):
-    """Return the error of dead reckoning due to the noise."""
-    runs = [f'{significant(float(np.hypot(*shares.values())), 2)} m after {duration(seconds)}'
+    runs = [f'{significant(float(np.linalg.norm(list(shares.values()))), 2)} m after {duration(seconds)}'
             for seconds, shares in position_budget(figures)]
-    return f'error of dead reckoning from rest by noise only: {", ".join(runs)}'
+    return [*found, *([longest] if longest else []), f'error of dead reckoning from rest by noise only: {", ".join(runs)}']
 
 
 def _rest_line(recording):

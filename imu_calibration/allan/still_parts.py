@@ -9,6 +9,7 @@ from scipy.ndimage import maximum_filter1d, median_filter
 
 from imu_calibration.core.samples import NominalScaling, SampleBlock, runs_of
 from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.rest_detection import shrunk
 from imu_calibration.preprocessing.scan import CHUNK_SECONDS, Chunks, ChunkSeries, still_chunks
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 
@@ -77,15 +78,15 @@ def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], LeftOut
     same = _at_the_usual_rate(chunks, period)
     still = _usual(chunks, still_chunks(chunks) & same)
     margin = int(np.ceil(SETTLING / seconds)) if seconds else 0
-    shrunk = _shrunk(still, margin)
+    inner = shrunk(still, margin)
     parts, short = [], 0.0
-    for first, last in _unbroken_runs(shrunk, np.diff(chunks.time) > BRIDGE):
+    for first, last in _unbroken_runs(inner, np.diff(chunks.time) > BRIDGE):
         part = _part(chunks, first, last)
         if part.seconds >= MIN_STILL_SECONDS:
             parts.append(part)
         else:
             short += part.seconds
-    moved = float(np.sum(~shrunk & same)) * seconds
+    moved = float(np.sum(~inner & same)) * seconds
     return parts, LeftOut(moved, short, float(np.sum(~same)) * seconds)
 
 
@@ -141,13 +142,6 @@ def _centre(values):
     """Return the median and the robust standard deviation."""
     middle = np.median(values)
     return middle, 1.4826 * np.median(np.abs(values - middle))
-
-
-def _shrunk(still, margin):
-    """Return where rest lasts for `margin` chunks on both sides; the ends of the recording are no motion."""
-    moving = np.concatenate([[0], np.cumsum(~still)])
-    index = np.arange(len(still))
-    return moving[np.minimum(index + margin + 1, len(still))] == moving[np.maximum(index - margin, 0)]
 
 
 def _unbroken_runs(mask, broken):

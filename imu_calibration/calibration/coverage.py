@@ -59,18 +59,14 @@ def group_states(result: CalibrationResult) -> list[GroupState]:
     for effect in calibration.model.effects:
         part = calibration.model.slices[effect.key]
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
-        state = group_status(calibration.status[part])
+        status = calibration.status[part]
+        state = next((word for word in (Progress.HELD, Progress.WEAK) if word in status), Progress.DETERMINED)   # the worst
         lacking = () if state == Progress.DETERMINED else (names[worst], *names[part])
         known = [result.needed[name] for name in lacking if name in result.needed]
         text, predicted = known[0] if known else ('', float('nan'))
         states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
                                  effect.unit_of(worst - part.start), text, predicted))
     return states
-
-
-def group_status(statuses: Sequence[str]) -> Progress:
-    """Return the worst of the statuses of an effect's parameters."""
-    return next((progress for progress in (Progress.HELD, Progress.WEAK) if progress in statuses), Progress.DETERMINED)
 
 
 def waiting_groups(model: SensorModel) -> list[GroupState]:
@@ -195,14 +191,13 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
         return added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=result.gravity)
     after = np.array([left(base + added(rest_with_up(up))) for up in DIRECTIONS])
     worth = share_gained(left(base), after)
-    first, seconds = _foretold(base, left, added, _possible_motions(result.table))
+    possible = possible_motions(result.table)
+    motions = [motion for motion in (MOTIONS if possible is None else possible) if motion.seconds < MAX_MOTION_SECONDS]
+    first, seconds = _foretold(base, left, added, motions)
     step = _next_on_table(result) if first is None else _step(first.text)
-    return Coverage(worth, _rests_of(result), None, step, seconds, (), _arms(result), frame_id)
-
-
-def _possible_motions(table):
-    possible = possible_motions(table)
-    return [motion for motion in (MOTIONS if possible is None else possible) if motion.seconds < MAX_MOTION_SECONDS]
+    errors = result.window_errors()
+    force = errors.true['accelerometer'][np.asarray(errors.kind) == 'static']
+    return Coverage(worth, force / np.linalg.norm(force, axis=1, keepdims=True), None, step, seconds, (), _arms(result), frame_id)
 
 
 def _foretold(information, left, added, motions):
@@ -219,13 +214,6 @@ def _foretold(information, left, added, motions):
         first, seconds = first or motions[best], seconds + motions[best].seconds
         information, missing = information + more[best], remaining[best]
     return None, float('nan')
-
-
-def _rests_of(result):
-    """Return the directions that were up in static windows."""
-    errors = result.window_errors()
-    force = errors.true['accelerometer'][np.asarray(errors.kind) == 'static']
-    return force / np.linalg.norm(force, axis=1, keepdims=True) if len(force) else np.zeros((0, 3))
 
 
 def _next_on_table(result):

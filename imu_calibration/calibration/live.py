@@ -107,19 +107,19 @@ class LiveCalibration:
         known = [part.frame_id for part in (self.earlier, self._collector and self._collector.gathered) if part]
         return next(filter(None, known), '')
 
-    def change_windows(self, windows: WindowSettings) -> None:
-        """Find windows by other settings from now on; raises an InputError when these cannot be changed any more."""
-        if self._collector is not None:
-            self._collector.gatherer.change(windows)
-        self.options = replace(self.options, windows=windows)
+    def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
+        """Use other settings from now on, by hand without effect; raises an InputError when they cannot be changed any more."""
+        if isinstance(settings, LiveSettings):
+            self.settings = settings
+        elif isinstance(settings, WindowSettings):
+            if self._collector is not None:
+                self._collector.gatherer.change(settings)
+            self.options = replace(self.options, windows=settings)
 
     @property
     def on_table(self) -> TableSession:
         """The session itself: model errors can be diagnosed while it runs."""
         return self
-
-    def change_by_hand(self, by_hand: LiveByHandSettings) -> None:
-        """No effect: gravity is given by the table."""
 
     @property
     def model(self) -> SensorModel | None:

@@ -90,15 +90,15 @@ class LiveByHand:
         imu = self._store.samples()
         return '' if imu is None else imu.frame_id
 
-    def change_windows(self, windows: WindowSettings) -> None:
-        """Use other settings for the poses from now on, in all samples."""
-        self.options = replace(self.options, windows=windows)
-        self._search(self._store)
-
-    def change_by_hand(self, by_hand: LiveByHandSettings) -> None:
-        """Use another gravity, or keep another number of samples."""
-        self.options = by_hand.at_place(self.options)
-        self._store.most = by_hand.hand_samples
+    def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
+        """Use other settings from now on: for the poses in all samples, another gravity, another number of samples."""
+        if isinstance(settings, LiveSettings):
+            self.settings = settings
+        elif isinstance(settings, WindowSettings):
+            self.options = replace(self.options, windows=settings)
+            self._search(self._store)
+        else:
+            self.options, self._store.most = settings.at_place(self.options), settings.hand_samples
 
     @property
     def n_windows(self) -> int:

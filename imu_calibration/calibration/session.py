@@ -222,8 +222,5 @@ class LiveSession(Protocol):
     def coverage(self) -> Coverage:
         """Return the gain of further attitudes, and the next step."""
 
-    def change_windows(self, windows: WindowSettings) -> None:
-        """Find windows or poses by other settings from now on."""
-
-    def change_by_hand(self, by_hand: LiveByHandSettings) -> None:
-        """Apply the settings of a calibration by hand."""
+    def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
+        """Use other settings from now on."""

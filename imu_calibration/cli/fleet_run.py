@@ -92,7 +92,8 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
     units = [unit_of(name, paths, topics_of(choices), joint_names=table.joint_names, options=used) for name, paths in found]
     with files.output_folder(options.output) as folder:
         advance = counter('units', len(units))
-        mapper = _mapper(options, len(units), lambda result: advance(1))
+        mapper = cluster_mapper(options.scheduler, lambda result: advance(1)) if options.scheduler else \
+            process_mapper(jobs_for(options.jobs, len(units)), lambda result: advance(1))
         results = mapper(FleetStep(table, settings, None if options.no_report else calibration_report), units)
         spreads = summarise(results)
         for result in results:
@@ -118,12 +119,6 @@ def _table(options, bags):
         except InputError:
             pass
     return table_of(stand, bags[-1:], topics_of(choices_of(options)))
-
-
-def _mapper(options, n_units, done):
-    if options.scheduler:
-        return cluster_mapper(options.scheduler, done)
-    return process_mapper(jobs_for(options.jobs, n_units), done)
 
 
 def parameter_rows(spreads: Sequence[Spread]) -> list[dict[str, Any]]:

@@ -77,10 +77,6 @@ def _is_joint_errors(value):
                                            for name in ('turning', 'zeros', 'angles'))
 
 
-def _is_decision(value):
-    return value in tuple(SensorDecision)
-
-
 _NOISE = {'noise_sd': _is_triple_of_sizes, 'between_window_sd': _is_size, 'wander_sd': _is_size}
 _PROOF = {'before': _is_size, 'after': _is_size, 'ci95': lambda value: _is_range(value, _is_size), 'unit': _is_text, 'windows': _is_count}
 
@@ -98,7 +94,7 @@ KEYS_OF_PARTS = {
     'undetermined_directions': _or_none(_is_list_of(_is_direction)),
     'statistics': {sensor: _NOISE for sensor in SENSORS},
     'conditions': {'largest_rate': _or_none(_is_size), 'temperature_range_c': _or_none(_is_temperature_range), 'date': _is_text},
-    'decision': {sensor: _is_decision for sensor in SENSORS}, 'decision_reasons': {sensor: _is_text for sensor in SENSORS},
+    'decision': dict.fromkeys(SENSORS, tuple(SensorDecision).__contains__), 'decision_reasons': {sensor: _is_text for sensor in SENSORS},
     'notes': _is_list_of(_is_text),
     'proof': {sensor: _is_proof for sensor in SENSORS},
 }
@@ -360,13 +356,10 @@ def from_mapping(document: Any) -> Calibration:
     try:
         calibration = Calibration(**parts_of(document))
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, InputError) as error:
+        text = str(error) if isinstance(error, InputError) else f'{type(error).__name__}: {error}'
         raise DocumentError(f'a calibration document must have the parts of {CALIBRATION_FORMAT}, one is missing or has another shape '
-                            f'({_one_line(error)}); calibrate again', code=getattr(error, 'code', '') or 'document_parts') from error
+                            f'({shortened(text, 200)}); calibrate again', code=getattr(error, 'code', '') or 'document_parts') from error
     return check_numbers(calibration)
-
-
-def _one_line(error):
-    return shortened(str(error) if isinstance(error, InputError) else f'{type(error).__name__}: {error}', 200)
 
 
 def _check_format(found):

@@ -9,7 +9,7 @@ import numpy as np
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import HAND_AXES, Calibration, beyond_instruments, listed, with_nominal
-from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN, decisions_text, reason_of
+from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN, reason_of
 from imu_calibration.effects.base import SENSORS, UNITS, Effect
 from imu_calibration.effects.forward_equations import Centre, coefficients, in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel
@@ -240,11 +240,6 @@ def missing(calibration: Calibration) -> str:
     known = calibration.status_by_name
     names = [name for name, status in known.items() if status in LACKING]
     return f'{len(names)} of {len(known)} parameters not determined ({listed(names)})' if names else ''
-
-
-def standing(calibration: Calibration) -> str:
-    """Return the decisions in short, for one line in a log."""
-    return decisions_text(calibration.decisions)
 
 
 def with_measured_noise(calibration: Calibration, figures: 'NoiseFigures') -> Calibration:

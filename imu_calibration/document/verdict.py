@@ -264,14 +264,10 @@ def _blind(calibration):
         own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
         matrix_held = all(status == HELD for status in calibration.status[calibration.model.part(sensor, Role.LINEAR)])
         if own and matrix_held and DETERMINED not in own:
-            reasons.append(Reason(WARNING, f'the recording does not determine the {sensor}', _first_need(calibration, sensor),
-                                  sensors=(sensor,)))
+            needs = [d['needs'] for d in calibration.undetermined if any(name.startswith(sensor) for name in d['parameters'])]
+            step = needs[0] if needs else 'record static poses and turns about all three axes'
+            reasons.append(Reason(WARNING, f'the recording does not determine the {sensor}', step, sensors=(sensor,)))
     return reasons
-
-
-def _first_need(calibration, start=''):
-    needs = [d['needs'] for d in calibration.undetermined if any(name.startswith(start) for name in d['parameters'])]
-    return needs[0] if needs else 'record static poses and turns about all three axes'
 
 
 def _undetermined(calibration):

@@ -12,6 +12,7 @@ from imu_calibration.document import files, trust
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text
 from imu_calibration.document.comparison import moved_beyond_sd
+from imu_calibration.document.decision import decisions_text
 from imu_calibration.document.trust import with_measured_noise
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.robot_stand import TF_STATIC, StaticFrames
@@ -116,7 +117,7 @@ class Adopted:
 
     def line(self) -> str:
         """Return one line that describes the calibration in force."""
-        return f'calibration {self.version} from {self.source} ({trust.standing(self.calibration)}) adopted'
+        return f'calibration {self.version} from {self.source} ({decisions_text(self.calibration.decisions)}) adopted'
 
     def says_more_than(self, other: 'Adopted | None') -> bool:
         """Return whether the change from `other` must be reported: its source, decisions or values differ."""

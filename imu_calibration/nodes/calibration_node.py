@@ -102,10 +102,10 @@ class CalibrationNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__('calibration_node', **options)
         self.settings = declare_parameters(self, CalibrationNodeSettings, self._change_files, hints=HINTS['calibration_node'])
-        self._live_settings = declare_parameters(self, LiveSettings, self._change_live)
-        windows = declare_parameters(self, WindowSettings, self._change_windows)
+        self._live_settings = declare_parameters(self, LiveSettings, self._change_session)
+        windows = declare_parameters(self, WindowSettings, self._change_session)
         self._options = replace(calibration_options({name: chosen or None for name, chosen in self._choices().items()}), windows=windows)
-        self._hand_settings = declare_parameters(self, LiveByHandSettings, self._change_by_hand)
+        self._hand_settings = declare_parameters(self, LiveByHandSettings, self._change_session)
         robot = declare_parameters(self, RobotSettings)
         joints = [] if not robot.urdf_file and self.settings.table_file in NO_TABLE else ['joint_states']
         announce(self, ['imu/data_raw', *joints, 'imu/temperature'], ['imu/calibration', 'imu/residual', 'imu/coverage'])
@@ -185,17 +185,14 @@ class CalibrationNode(Node):
     def _change_files(self, group: CalibrationNodeSettings) -> None:
         self.worker.autosave_period, self.settings = group.autosave_period, group
 
-    def _change_live(self, group: LiveSettings) -> None:
-        self._live_settings = group
-        self.worker.ask(lambda: self.worker.change_settings(group))
-
-    def _change_windows(self, group: WindowSettings) -> None:
-        self._options = replace(self._options, windows=group)
-        self.worker.ask(lambda: self.worker.change_windows(group))
-
-    def _change_by_hand(self, group: LiveByHandSettings) -> None:
-        self._hand_settings = group
-        self.worker.ask(lambda: self.worker.change_by_hand(group))
+    def _change_session(self, group: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
+        if isinstance(group, WindowSettings):
+            self._options = replace(self._options, windows=group)
+        elif isinstance(group, LiveSettings):
+            self._live_settings = group
+        else:
+            self._hand_settings = group
+        self.worker.ask(lambda: self.worker.change(group))
 
     def _publish_document(self, text: str) -> None:
         self._publish(self._document, String(data=text))

@@ -246,22 +246,14 @@ class CalibrationWorker(threading.Thread):
         return True, (f'restarted, {lost} unsaved {self.gathered} were deleted; ' if lost else 'restarted; ') + \
             'the last calibration remains published until the next one'
 
-    def change_settings(self, settings: LiveSettings) -> tuple[bool, str]:
-        """Use the intervals of other LiveSettings."""
-        self.live.settings = settings
-        self._pacer = SolvePacer(settings.solve_share)
-        self._diagnosis.change(self._diagnosis_period)
-        return True, ''
-
-    def change_windows(self, windows: WindowSettings) -> tuple[bool, str]:
-        """Use other WindowSettings for windows from now on."""
-        self.live.change_windows(windows)
-        return True, ''
-
-    def change_by_hand(self, by_hand: LiveByHandSettings) -> tuple[bool, str]:
-        """Use other LiveByHandSettings; another gravity changes the solution at once."""
-        self.live.change_by_hand(by_hand)
-        self._new_windows = self.live.n_windows > 0
+    def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> tuple[bool, str]:
+        """Use other settings from now on; another gravity by hand changes the solution at once."""
+        self.live.change(settings)
+        if isinstance(settings, LiveSettings):
+            self._pacer = SolvePacer(settings.solve_share)
+            self._diagnosis.change(self._diagnosis_period)
+        elif isinstance(settings, LiveByHandSettings):
+            self._new_windows = self.live.n_windows > 0
         return True, ''
 
     def _autosave(self) -> None:

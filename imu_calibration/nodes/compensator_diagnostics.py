@@ -9,7 +9,7 @@ import numpy as np
 from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, MOVED, UNIT, WAITING
 from imu_calibration.core.units import HOTTEST_C
-from imu_calibration.document import trust
+from imu_calibration.document.decision import decisions_text
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.nodes.adoption import Adopted
 from imu_calibration.nodes.complaints import REMINDER
@@ -73,7 +73,7 @@ class CompensatorDiagnostics:
         adopted: Adopted | None = node.adopted
         notes += [] if adopted is None else adopted.caveats
         level = ERROR if serious else WARN if notes else OK
-        good = '' if adopted is None else f'corrected with calibration {adopted.version} ({trust.standing(adopted.calibration)})'
+        good = '' if adopted is None else f'corrected with calibration {adopted.version} ({decisions_text(adopted.calibration.decisions)})'
         frame_id = '' if adopted is None else adopted.calibration.frame_id
         return [*self._health(compensation, frame_id),
                 make_status(level, 'compensation', '; '.join(serious + notes) or good, values=self._values(), hardware_id=frame_id)]
@@ -169,7 +169,7 @@ class CompensatorDiagnostics:
         if adopted is None:
             return values
         calibration, compensation = adopted.calibration, adopted.compensation
-        values |= {'decision': trust.standing(calibration), 'not corrected': ', '.join(adopted.used.refused) or 'none',
+        values |= {'decision': decisions_text(calibration.decisions), 'not corrected': ', '.join(adopted.used.refused) or 'none',
                    'date': calibration.conditions.get('date', ''),
                    'parameters': len(calibration.status), 'not determined': sum(status in LACKING for status in calibration.status),
                    'messages': compensation.received, 'corrected': compensation.corrected, **compensation.counts}

@@ -107,10 +107,6 @@ class CompensatorNode(Node):
         else:
             rclpy.spin(self)
 
-    def close(self) -> str:
-        """Close the view."""
-        return ''
-
     def convert(self, data: bytes, information: dict) -> bytes | None:
         """Return the serialized message to publish, or None."""
         current = self._current

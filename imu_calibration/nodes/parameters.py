@@ -3,7 +3,6 @@
 import ast
 import importlib
 import json
-import math
 import sys
 import textwrap
 from collections.abc import Callable
@@ -62,7 +61,7 @@ def declare_parameters(node: Node, group: type, take: Callable[[Any], None] | No
         try:
             value = node.declare_parameter(item.name, _to_ros(item.default), parameter_descriptor(item)).value
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            raise InputError(f"parameter '{item.name}' must be {_type_name(item.default)}{_range_text(item.bounds)}: {error}") from error
+            raise InputError(f"parameter '{item.name}' must be {_type_name(item.default)}{range_text(item.bounds)}: {error}") from error
         values[item.name] = _from_ros(item, value)
     settings = override(group(), values)
     _watch(node, _Group(settings, take, hints or {}))
@@ -170,11 +169,6 @@ def _from_ros(item: Setting, value: Any) -> Any:
 def _type_name(default: Any) -> str:
     return {bool: 'true or false', int: 'a whole number', float: 'a number with a decimal point', str: 'a text',
             tuple: 'a list of numbers with decimal points'}[type(default)]
-
-
-def _range_text(bounds: tuple) -> str:
-    low, high = (math.inf * sign if bound is None else bound for bound, sign in zip(bounds, (-1, 1), strict=True))
-    return '' if bounds == (None, None) else f' in [{low:g}, {high:g}]'
 
 
 _ARM = {'allow_xacro': "parameter 'allow_xacro'", 'urdf': "parameter 'urdf_file'", 'imu_link': "parameter 'imu_link'"}

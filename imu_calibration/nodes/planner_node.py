@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -30,7 +29,6 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text
 from imu_calibration.kinematics.motion_limits import (
     NOT_CHECKED,
-    MotionLimits,
     TrajectoryPoints,
     limit_words,
     limits_of,
@@ -85,12 +83,6 @@ class PlannerNodeSettings:
                                fixed='the range of every joint is set at the first start')
     calibration_node: str = setting('calibration_node', '', 'name of the node that collects the windows',
                                     symptom='~/start reports a missing service')
-
-
-def restricted_limits(limits: MotionLimits, position: np.ndarray, settings: PlannerNodeSettings) -> MotionLimits:
-    """Return the limits of the joints restricted by `max_turns` and `reach_deg` about a position."""
-    limits = limits.wound(position, settings.max_turns)
-    return limits.reached(position, settings.reach_deg) if settings.reach_deg else limits
 
 
 CLOCK_CHECK_SECONDS = 0.1
@@ -319,7 +311,8 @@ class PlannerNode(Node):
         if not self._calibrator['solve'].service_is_ready():
             return False, f'service {self._calibrator["solve"].srv_name} does not exist; start calibration_node, which collects the windows'
         if not self._is_placed:
-            self.driver.limits, self._is_placed = restricted_limits(self.driver.limits, self.driver.position, self.settings), True
+            limits, reach = self.driver.limits.wound(self.driver.position, self.settings.max_turns), self.settings.reach_deg
+            self.driver.limits, self._is_placed = limits.reached(self.driver.position, reach) if reach else limits, True
         self.worker.go(motions)
         what = 'one motion, then it rests' if motions > 0 else \
             'plans and moves until every parameter is within its tolerance; the first motion is small, the first large one slow'

@@ -21,11 +21,8 @@ from trajectory_msgs.msg import JointTrajectory
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
-from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.decision import BY_DEFINITION
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
-from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.kinematics.motion_limits import limits_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
@@ -40,6 +37,7 @@ from imu_calibration.simulation.sensor_noise import CAUSES, GRADES, hidden_cause
 from imu_calibration.simulation.session import SimulationOptions, random_values
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 from imu_calibration.use_cases.resources import config_file
+from imu_calibration.use_cases.simulate import true_calibration
 from msg_adapters.joint_state import trajectory_from_message
 from msg_adapters.write import encode_imu, encode_joints, encode_temperature, rows
 
@@ -164,9 +162,7 @@ class SimulatorNode(Node):
                                  frame_id=settings.frame_id)
 
     def _publish_truth(self, model, values):
-        truth = Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), self.settings.frame_id,
-                            {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': {'seed': self.settings.seed}},
-                            **BY_DEFINITION)
+        truth = true_calibration(model, values, self.settings.frame_id, {'seed': self.settings.seed})
         self._truth = self.create_publisher(String, '~/truth', latched_qos())
         self._truth.publish(String(data=calibration_to_text(truth)))
 

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from imu_calibration.core.samples import smallest_step
+from imu_calibration.core.samples import runs_of, smallest_step
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.chain import reference_motion
@@ -57,7 +57,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     known = np.isfinite(step)   # an axis without motion has the steps of the other axes
     step = np.where(known, step, step[known].max(initial=0.0)) if coarse else np.zeros(3)
     spans = _joined((float(window.time[start]), float(window.time[stop - 1]))
-                    for window, flags, turns, rate in zip(windows, same, turning, expected) for start, stop in _runs(flags)
+                    for window, flags, turns, rate in zip(windows, same, turning, expected) for start, stop in runs_of(flags)
                     if window.time[stop - 1] - window.time[start] >= LASTING and turns[start:stop].mean() > 0.5
                     and not _rounded(window.rate_s[start], rate[start:stop], bias, step))
     if spans:
@@ -75,7 +75,7 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
 
 def _frozen(window, table, expected, *, joint):
     """Yield (start, stop) in which a joint's state is constant while the residual rate is along its axis."""
-    for start, stop in _runs(np.abs(window.motion.rate[:, joint]) < MAX_REPEATED_RATE):
+    for start, stop in runs_of(np.abs(window.motion.rate[:, joint]) < MAX_REPEATED_RATE):
         if window.time[stop - 1] - window.time[start] < LASTING:
             continue
         motion, rest = window.motion.select(slice(start, stop)), (window.rate_s - expected)[start:stop]
@@ -96,11 +96,6 @@ def _rounded(reading, expected, bias, step):
     """Return whether one reading represents the reference rates, shape (n, 3), up to one step per axis and wrong gains and axes."""
     error = np.linalg.norm(reading - expected - bias, axis=1)
     return bool((np.ptp(expected, axis=0) <= step).all() and (error <= np.linalg.norm(step) + OWN * np.linalg.norm(expected, axis=1)).all())
-
-
-def _runs(flags):
-    """Return (start, stop) of the runs of true flags, shape (n, 2)."""
-    return np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(flags, int), [0]]))).reshape(-1, 2)
 
 
 def _joined(spans):

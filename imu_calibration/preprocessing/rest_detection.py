@@ -3,7 +3,7 @@
 from collections import deque
 
 import numpy as np
-from scipy.ndimage import minimum_filter1d, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
@@ -93,7 +93,7 @@ def _steady(force_s, rate_s, period, *, ratio, resting):
     least = minimum_filter1d(np.where(at_rest, variance, np.inf), around, axis=1, mode='nearest')
     floor = np.maximum(least, [[least_variance(force_s)], [least_variance(rate_s)]])
     steady = _covered(at_rest & np.all(variance <= ratio**2 * floor, axis=0), width)
-    return np.repeat(_shrunk(steady, int(np.ceil(_GUARD / period / cell))), np.diff(edges))
+    return np.repeat(shrunk(steady, int(np.ceil(_GUARD / period / cell))), np.diff(edges))
 
 
 def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, ratio: float, longest: float, floor: QuietFloor,
@@ -147,7 +147,7 @@ def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, rat
             across = _covered(calm, width - 1)
             quiet[:-1] &= across
             quiet[1:] &= across
-    return np.repeat(_shrunk(quiet, int(np.ceil(_GUARD / period / cell))), np.diff(edges))
+    return np.repeat(shrunk(quiet, int(np.ceil(_GUARD / period / cell))), np.diff(edges))
 
 
 def _chunk_floor(variance, width, at_rest):
@@ -200,16 +200,13 @@ def _running(values):
 
 def _covered(calm, width):
     """Return for each cell whether one of the calm spans of `width` cells contains it."""
-    sums = np.concatenate([[0], np.cumsum(calm)])
-    cell = np.arange(len(calm) + width - 1)
-    return sums[np.minimum(cell, len(calm) - 1) + 1] > sums[np.maximum(cell - width + 1, 0)]
+    padded = np.concatenate([calm, np.zeros(width - 1, bool)])
+    return maximum_filter1d(padded, width, origin=(width - 1) // 2, mode='constant')
 
 
-def _shrunk(mask, margin):
-    """Return `mask` without the cells within `margin` cells of a False one."""
-    sums = np.concatenate([[0], np.cumsum(~mask)])
-    cell = np.arange(len(mask))
-    return sums[np.minimum(cell + margin + 1, len(mask))] == sums[np.maximum(cell - margin, 0)]
+def shrunk(mask: np.ndarray, margin: int) -> np.ndarray:
+    """Return `mask` without the cells within `margin` cells of a False one; beyond the ends nothing is False."""
+    return minimum_filter1d(mask, 2 * margin + 1, mode='constant', cval=1)
 
 
 _TURNING_SD = 30.0

@@ -17,7 +17,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import DEG, decimals
 from imu_calibration.document import files
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.report.page import fixed, pair
+from imu_calibration.report.page import fixed, pair, raised
 from imu_calibration.selection.spectrum import MIN_LINE_POWER
 from imu_calibration.selection.unexplained import Unexplained
 
@@ -165,7 +165,7 @@ def decade(value: float) -> str:
     exponent = round(math.log10(value))
     if -3 <= exponent <= 3:
         return f'{10.0**exponent:g}'
-    return '10' + str(exponent).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))
+    return '10' + raised(exponent)
 
 
 def axis_legend(axes: Any, where: str = 'upper right', **more: Any) -> None:

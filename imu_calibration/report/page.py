@@ -25,11 +25,12 @@ def text(value: float | None, digits: int = 3) -> str:
     shown = significant(float(value), digits)
     if 'e' in shown:
         mantissa, _, power = shown.partition('e')
-        shown = f'{mantissa}·10{_raised(int(power))}'
+        shown = f'{mantissa}·10{raised(int(power))}'
     return shown.replace('-', '−')
 
 
-def _raised(power):
+def raised(power: int) -> str:
+    """Return a raised exponent."""
     return str(power).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))
 
 

@@ -151,7 +151,9 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     if around or reach is not None:
         limits, start = _neighbourhood(limits, table.joint_names, around or {}, reach)
     known = _known(calibration, table, options)
-    causes, sizes = (tuple(separate), {}) if separate or not diagnosis else _class_of(diagnosis)
+    causes, sizes = tuple(separate), {}
+    if diagnosis and not separate:
+        causes, sizes = class_in(diagnosis) if isinstance(diagnosis, Mapping) else files.read_mapping(diagnosis, 'diagnosis', class_in)
     if causes:
         if known is None:
             raise InputError('separation of effects needs the calibration of the diagnosis with the finding, none was given; give it',
@@ -214,10 +216,6 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
     found = plan_by_hand(model, tolerances=tolerances_of(model.model, options.tolerances), noise=noise, rate=imu_rate)
     return Planned(found, None, {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
                                  'reference': 'gravity, by hand'})
-
-
-def _class_of(diagnosis):
-    return class_in(diagnosis) if isinstance(diagnosis, Mapping) else files.read_mapping(diagnosis, 'diagnosis', class_in)
 
 
 def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, float]]:

@@ -16,6 +16,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import trust
 from imu_calibration.document.calibration_text import calibration_to_text, checked_tolerances, from_mapping, to_mapping
+from imu_calibration.document.decision import decisions_text
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from msg_adapters.imu import FIELDS
@@ -83,7 +84,7 @@ KNOWN_TO_WORK = set()
 def use(found):
     """Do with a calibration all that a robot does; fails with any error and with any number that is not finite."""
     refused = list(trust.refused_sensors(found, live=True))
-    against = refused, trust.caveats(found), trust.standing(found), outside_conditions(found, np.ones((1, 3)), np.array([25.0]))
+    against = refused, trust.caveats(found), decisions_text(found.decisions), outside_conditions(found, np.ones((1, 3)), np.array([25.0]))
     assert '\n' not in ''.join(line for part in against for line in part)
     assert to_mapping(found)
     noise = [found.noise(sensor) for sensor in ('accelerometer', 'gyroscope')]

@@ -62,7 +62,7 @@ def test_another_gravity_changes_the_next_solution(session):
     live = make_live()
     run(live, session)
     before = live.solve(pending=True)
-    live.change_by_hand(LiveByHandSettings(gravity=GRAVITY + 0.01))
+    live.change(LiveByHandSettings(gravity=GRAVITY + 0.01))
     after = live.solve(pending=True)
     assert_same(after, offline(session, GRAVITY + 0.01))
     assert after.gravity - before.gravity == pytest.approx(0.01)

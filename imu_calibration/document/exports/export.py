@@ -17,7 +17,7 @@ from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import to_mapping
 from imu_calibration.document.exports import targets
-from imu_calibration.document.exports.affine import ARMS, MATRICES, UNNAMED, AffineImu, Placement, affine_of, moved, pose_line
+from imu_calibration.document.exports.affine import ARMS, MATRICES, UNNAMED, Placement, affine_of, moved, pose_line
 from imu_calibration.document.exports.loss import ROUNDING_LOSS, Loss, TrialMotion, loss_of, standard_motion
 from imu_calibration.document.exports.target import Noise, Numbers, Page, Readings, Target
 from imu_calibration.document.trust import Usable, caveats, usable
@@ -84,8 +84,9 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
     placement, numbers = placed_numbers(applied, target)
     motion = motion or standard_motion(applied)
     loss = loss_of(target, calibration, numbers, placement=placement, motion=motion)
+    trust = [f'of the calibration: {line}' for line in (*used.lines, *caveats(applied))]
     lines = [*_placement_lines(applied, target, placement), *_worked_sample(target, numbers, placement, applied),
-             *loss_lines(target, loss), *(f'note: {line}' for line in (*_trust_lines(used), *target.ignored(numbers), *unknown)),
+             *loss_lines(target, loss), *(f'note: {line}' for line in (*trust, *target.ignored(numbers), *unknown)),
              *(f'note: {hint}' for hint in [target.hint] if hint)]
     head = [f'{target.title}, written by imu_calibration {imu_calibration.__version__}', *target.formula.splitlines(), f'({target.source})']
     rate = rate or (noise.rate if noise else None)
@@ -99,13 +100,8 @@ def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement,
     if target.whole:
         return Placement(), to_mapping(calibration)
     held = affine_of(calibration, target.holds)
-    placement = target.placement(_with_arms_and_matrices(calibration, held))
+    placement = target.placement(affine_of(calibration, MATRICES + ARMS if np.any(held.arms) else MATRICES))
     return placement, target.numbers(moved(held, placement))
-
-
-def _with_arms_and_matrices(calibration, held) -> AffineImu:
-    """Return the IMU by which a target chooses its axes: with full matrices, also where it has diagonals only."""
-    return affine_of(calibration, MATRICES + ARMS) if np.any(held.arms) else affine_of(calibration, MATRICES)
 
 
 def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, list[str]]:
@@ -120,11 +116,6 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
                              code='noise_missing')
         return None, [f'the noise figures are left out: there must be {lacks} from a noise document']
     return target.noise(found), _walk_lines(found) if target.needs_walk else []
-
-
-def _trust_lines(used: Usable) -> list[str]:
-    """Return the decisions other than `helps`, and the parameters that are not determined."""
-    return [f'of the calibration: {line}' for line in (*used.lines, *caveats(used.calibration))]
 
 
 def _walk_lines(noise: Noise) -> list[str]:
