@@ -259,6 +259,20 @@ def cells_of(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...]
                                         for wanted, done in zip(WANTED, DONE_COLOUR, strict=True)), 0.06 + 0.1 * share
 
 
+def arrows_of(coverage: Coverage) -> Iterator[tuple[str, np.ndarray, np.ndarray, tuple[float, ...]]]:
+    """Yield (name, start, end, colour) of each arrow: up direction now, direction or axis of the next motion, arms that are not zero."""
+    step, centre = coverage.next, np.zeros(3)
+    if coverage.up is not None:
+        yield 'up now', centre, 0.85 * RADIUS * coverage.up, NOW
+    if step.up is not None:
+        yield 'next', centre, 1.25 * RADIUS * step.up, ARROW
+    elif step.axis is not None:
+        yield 'next', -1.25 * RADIUS * step.axis, 1.25 * RADIUS * step.axis, ARROW
+    for colour, arm in zip(0.9 * np.eye(3), [] if coverage.arms is None else coverage.arms, strict=False):
+        if arm.any():
+            yield 'arms', centre, ARMS_TIMES * arm, tuple(colour)
+
+
 def line_of(coverage: Coverage) -> str:
     """Return the line of text next to the sphere."""
     if coverage.done:

@@ -180,3 +180,9 @@ def _hermite(left, right, step, by):
             total += coefficients[power]
         coefficients = [coefficients[0]] * (order + 1) + [(power - order) * coefficients[power] for power in range(order + 1, 8)]
     return found / scale
+
+
+def rest_at(position: np.ndarray) -> JointMotion:
+    """Return rest at each of the positions, shape (n, n_joints), at time zero."""
+    zero = np.zeros_like(position)
+    return JointMotion(np.zeros(len(position)), position, zero, zero, zero)

@@ -12,16 +12,15 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from imu_calibration.calibration.coverage import (
-    ARMS_TIMES,
     ARROW,
     DONE_COLOUR,
-    NOW,
     RADIUS,
     SEEN_DIAMETER,
     TEXT_COLOUR,
     VISITED,
     Coverage,
     GroupState,
+    arrows_of,
     cells_of,
     line_of,
 )
@@ -198,7 +197,8 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     next one, a ring of the turn between them; blue points: earlier up directions; the arms of the three sensitive points; one line of text.
     """
     frame = coverage.frame_id or 'imu_link'
-    made = [_marker('all', 0, Marker.SPHERE), *_cells(coverage), *_seen(coverage), *_next(coverage), *_arms(coverage), _text(coverage)]
+    arrows = [_arrow(*each, number=k) for k, each in enumerate(arrows_of(coverage))]
+    made = [_marker('all', 0, Marker.SPHERE), *_cells(coverage), *_seen(coverage), *arrows, *_turn(coverage), _text(coverage)]
     made[0].action = Marker.DELETEALL
     for marker in made:
         marker.header.frame_id, marker.header.stamp = frame, stamp
@@ -242,27 +242,16 @@ def _seen(coverage):
         marker = _marker('seen', 0, Marker.SPHERE_LIST, color=VISITED, scale=(SEEN_DIAMETER,) * 3)
         marker.points = [_point(1.1 * RADIUS * up) for up in coverage.seen]
         yield marker
-    if coverage.up is not None:
-        yield _arrow('up now', np.zeros(3), 0.85 * RADIUS * coverage.up, NOW)
 
 
-def _next(coverage):
+def _turn(coverage):
     step = coverage.next
-    if step.up is not None:
-        yield _arrow('next', np.zeros(3), 1.25 * RADIUS * step.up, ARROW)
     if step.axis is not None and coverage.up is not None and step.up is not None:
         ring = _marker('turn', 0, Marker.LINE_STRIP, color=ARROW, alpha=0.7, scale=(0.012, 0.0, 0.0))
         angles = np.linspace(0, step.angle, 24)
         across = np.cross(step.axis, coverage.up)
         ring.points = [_point(0.7 * RADIUS * (np.cos(a) * coverage.up - np.sin(a) * across)) for a in angles]
         yield ring
-    elif step.axis is not None:
-        yield _arrow('next', -1.25 * RADIUS * step.axis, 1.25 * RADIUS * step.axis, ARROW)
-
-
-def _arms(coverage):
-    for k, arm in enumerate([] if coverage.arms is None else coverage.arms):
-        yield _arrow('arms', np.zeros(3), ARMS_TIMES * arm, tuple(np.eye(3)[k] * 0.9), number=k)
 
 
 def _arrow(name, start, end, color, number=0):

@@ -51,6 +51,11 @@ class Coordinates:
         self.prior_information = own.T @ own
         """Of z, shape (n, n)."""
 
+    def excess(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the standard deviations of the requested parameters, in tolerances, shape (p,); leading axes are kept."""
+        variance = np.einsum('pn,...nm,pm->...p', self.asked, covariance, self.asked, optimize=True)
+        return np.sqrt(np.maximum(variance, 1e-300))
+
     @property
     def size(self) -> int:
         """Number of coordinates."""
@@ -133,19 +138,14 @@ class WithinTolerances:
     def __init__(self, coordinates: Coordinates, weights: np.ndarray | float = 1.0):
         self.coordinates, self.weights = coordinates, weights
 
-    def excess(self, covariance: np.ndarray) -> np.ndarray:
-        """Return standard deviations of the requested parameters, in tolerances, shape (k, p)."""
-        asked = self.coordinates.asked
-        return np.sqrt(np.maximum(np.einsum('pn,knm,pm->kp', asked, covariance, asked, optimize=True), 1e-300))
-
     def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
         """Return the weighted sum of the logarithms of the excess."""
-        return (self.weights * np.maximum(np.log(margin * self.excess(covariance)), 0.0)).sum(axis=1)
+        return (self.weights * np.maximum(np.log(margin * self.coordinates.excess(covariance)), 0.0)).sum(axis=1)
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
         """Return the parameters outside their tolerance."""
         names = np.array(self.coordinates.model.param_names)[self.coordinates.wanted]
-        return tuple(names[self.excess(covariance[None])[0] > 1.0 + 1e-6].tolist())
+        return tuple(names[self.coordinates.excess(covariance) > 1.0 + 1e-6].tolist())
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,9 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import setting
 from imu_calibration.core.units import DEG
+from imu_calibration.kinematics.joint_motion import rest_at
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
-from imu_calibration.planning.path_watch import PathWatch, at_rest
+from imu_calibration.planning.path_watch import PathWatch
 from imu_calibration.simulation.table_controller import LIMIT_ROUNDING, excess, trajectory_from
 
 OVERSPEED = 1.25
@@ -178,7 +179,7 @@ class Driver:
 
     def _require_within_limits(self, points):
         assert self.position is not None
-        path = trajectory_from(at_rest(self.position), points)
+        path = trajectory_from(rest_at(self.position[None]), points)
         beyond, speed, acceleration = excess(path, self.limits)
         # A joint whose encoder reads slightly outside its range may return into it.
         outside = np.maximum(self.limits.lower - self.position, self.position - self.limits.upper)

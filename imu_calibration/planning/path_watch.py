@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.joint_motion import rest_at
 from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from imu_calibration.simulation.table_controller import trajectory_from
 
@@ -25,12 +25,6 @@ STALLED_SECONDS = 1.0
 """Seconds of motion that identify a joint that does not move."""
 MAX_REST_RATE = 0.05
 """Largest rate at which a path counts as at rest, in tolerances per second."""
-
-
-def at_rest(position: np.ndarray) -> JointMotion:
-    """Return joints that rest at a position, shape (n_joints,), at time zero."""
-    zero = np.zeros((1, len(position)))
-    return JointMotion(np.zeros(1), np.asarray(position, float)[None], zero, zero, zero)
 
 
 LATENESS_TIE = 1e-3
@@ -55,7 +49,7 @@ class PathWatch:
     """
 
     def __init__(self, start: np.ndarray, points: TrajectoryPoints, tolerance: np.ndarray):
-        path = trajectory_from(at_rest(start), points)
+        path = trajectory_from(rest_at(np.asarray(start, float)[None]), points)
         count = max(int(np.ceil(points.duration / PATH_STEP_SECONDS)), 1)
         self._time = np.linspace(0.0, points.duration, count + 1)
         motion = path.at(self._time)

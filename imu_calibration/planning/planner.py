@@ -230,7 +230,7 @@ class Planner:
         """Standard deviation over tolerance of each requested parameter, estimated or predicted."""
         coordinates = self.situation.coordinates
         names = np.array(coordinates.model.param_names)[coordinates.wanted]
-        return dict(zip(names.tolist(), self.situation.excess(self._belief.known).tolist(), strict=True))
+        return dict(zip(names.tolist(), coordinates.excess(self._belief.known).tolist(), strict=True))
 
     def next_motion(self, position: np.ndarray) -> NextMotion:
         """Return the motion with the largest gain per second from where the joints are, and count on it."""
@@ -313,7 +313,7 @@ class Planner:
         self._visited.clear()
         return Plan(coordinates.model, tuple(self._named(number) for number in sequence), np.array([seconds for _, seconds in steps[1:]]),
                     coordinates.sd(covariance), coordinates.tolerances, coordinates.wanted,
-                    np.array([situation.excess(step) for step, _ in steps]), situation.goal.missing(cautious), start, bound,
+                    coordinates.excess(np.array([step for step, _ in steps])), situation.goal.missing(cautious), start, bound,
                     situation.goal.words)
 
     def _named(self, number: int) -> PlannedMotion:

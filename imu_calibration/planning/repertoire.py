@@ -13,7 +13,7 @@ import numpy as np
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint import Joint, JointLimits
-from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, Segment
@@ -135,12 +135,6 @@ def reachable(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
     wide = limits.turns & (limits.upper - limits.lower > 2 * np.pi)
     middle = 0.5 * (np.maximum(limits.lower, -ENDLESS_END) + np.minimum(limits.upper, ENDLESS_END))   # 0 without ends
     return np.where(wide, middle - np.pi, limits.lower), np.where(wide, middle + np.pi, limits.upper)
-
-
-def rest_at(position: np.ndarray) -> JointMotion:
-    """Return rest at each of the positions, shape (n, n_joints)."""
-    zero = np.zeros_like(position)
-    return JointMotion(np.zeros(len(position)), position, zero, zero, zero)
 
 
 def up_at(table: Table, position: np.ndarray) -> np.ndarray:

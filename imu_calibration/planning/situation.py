@@ -267,11 +267,6 @@ class Situation:
                 total = total + sum(additive_bound(window, self.noise) for window in windows) * max(seconds / length, 1.0)
         return np.linalg.inv(total)
 
-    def excess(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the standard deviations of the requested parameters, in tolerances, shape (p,)."""
-        asked = self.coordinates.asked
-        return np.sqrt(np.einsum('pn,nm,pm->p', asked, covariance, asked))
-
 
 def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
     """

@@ -18,7 +18,7 @@ from imu_calibration.papers.zhang2017 import axis_readings
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.figures import AFTER, GREY, INK, STATUS, derived_section, draw, lever_section, log_axis
 from imu_calibration.report.navigation_section import navigation_section
-from imu_calibration.report.page import fixed, in_unit, parameter_groups, render, text
+from imu_calibration.report.page import fixed, in_unit, parameter_groups, render, text, tile
 from imu_calibration.report.residuals import draw_windows, residual_section
 
 
@@ -329,17 +329,13 @@ def calibration_report(result: CalibrationResult) -> str:
 def tiles(result: CalibrationResult, navigation: dict[str, Any]) -> list[dict[str, str | None]]:
     """Return the main figures: the determined parameters, and the errors before and after."""
     asked = list(result.calibration.requested.values())
-    found = [_tile('parameters determined', f'{asked.count(DETERMINED)} of {len(asked)}', None, 'to their tolerances')]
+    found = [tile('parameters determined', f'{asked.count(DETERMINED)} of {len(asked)}', note='to their tolerances')]
     for sensor, entry in result.calibration.proof.items():
         after, before = (error_text(entry[which], entry['unit']) for which in ('after', 'before'))
-        found.append(_tile(f'{sensor} error on held-out data', after, before, f'{entry["windows"]} windows'))
+        number, _, unit = after.partition(' ')
+        found.append(tile(f'{sensor} error on held-out data', number, unit, before=before, note=f'{entry["windows"]} windows'))
     if navigation['rest']:
         after, before = navigation['rest']['position'][::-1]
-        found.append(_tile('position error after 50 s at rest', f'{after} m', f'{before} m',
-                           f"part of the calibration: {navigation['rest']['parts'][0][2]} m"))
+        found.append(tile('position error after 50 s at rest', after, 'm', before=f'{before} m',
+                          note=f"part of the calibration: {navigation['rest']['parts'][0][2]} m"))
     return found
-
-
-def _tile(what, after, before, note):
-    number, _, unit = after.partition(' ')
-    return {'what': what, 'number': number, 'unit': unit, 'before': before, 'note': note}

@@ -12,7 +12,7 @@ from imu_calibration.document.verdict import judge, unexplained_text
 from imu_calibration.effects.base import AXES, SENSORS, UNITS
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, Drawn, draw, draw_tones
 from imu_calibration.report.overlay import overlay_section, variables
-from imu_calibration.report.page import in_unit, parameter_groups, people, render, text
+from imu_calibration.report.page import in_unit, parameter_groups, people, render, text, tile
 
 BINS = 16
 FEW = 200
@@ -92,18 +92,17 @@ def _next_step(finding):
 
 
 def _tiles(diagnosis):
-    tiles = [{'what': 'effects tested', 'number': str(len(diagnosis.candidates)), 'unit': '', 'before': None,
-              'note': f'{len(diagnosis.not_testable)} more could not be tested'}]
+    tiles = [tile('effects tested', str(len(diagnosis.candidates)), note=f'{len(diagnosis.not_testable)} more could not be tested')]
     if diagnosis.findings:
         gain = diagnosis.gain
         number, _, unit = in_unit(gain.heldout_rms_after, UNITS[gain.sensor]).partition(' ')
-        tiles.append({'what': f'{gain.of} ({gain.sensor}, held-out {gain.measure})', 'number': number, 'unit': unit,
-                      'before': in_unit(gain.heldout_rms_before, UNITS[gain.sensor]), 'note': _reduction(gain)})
+        tiles.append(tile(f'{gain.of} ({gain.sensor}, held-out {gain.measure})', number, unit,
+                          before=in_unit(gain.heldout_rms_before, UNITS[gain.sensor]), note=_reduction(gain)))
     navigation = diagnosis.traces.dead_reckoning
     if navigation and diagnosis.findings:
-        tiles.append({'what': f'position error after {text(navigation["seconds"], 2)} s', 'number': text(navigation['position_after']),
-                      'unit': 'm', 'before': f'{text(navigation["position_before"])} m',
-                      'note': f'dead reckoning, runs: {navigation["stretches"]}, median'})
+        tiles.append(tile(f'position error after {text(navigation["seconds"], 2)} s', text(navigation['position_after']), 'm',
+                          before=f'{text(navigation["position_before"])} m',
+                          note=f'dead reckoning, runs: {navigation["stretches"]}, median'))
     return tiles
 
 

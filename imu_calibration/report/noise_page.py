@@ -12,7 +12,7 @@ from imu_calibration.allan.terms import TERM_DETERMINED, TERM_HELD, TERM_WEAK, p
 from imu_calibration.core.units import NOISE_QUANTITY, for_people
 from imu_calibration.effects.base import SENSORS, UNITS
 from imu_calibration.report.figures import AXIS_COLOURS, FAINT, GREY, MARKER, Drawn, draw, log_axis
-from imu_calibration.report.page import render, text
+from imu_calibration.report.page import render, text, tile
 
 
 def draw_curve(result: NoiseIdentification, sensor: str) -> Drawn:
@@ -114,7 +114,7 @@ def _tiles(figures, horizon):
         found = figures.densities(sensor, horizon)
         for what, number, of, note in (('noise density', found.white, unit, 'of the worst axis'),
                                        ('random walk', found.walk, walk_unit, document.BASIS[found.basis])):
-            tiles.append({'what': f'{sensor} {what}', 'number': text(number), 'unit': of, 'before': '', 'note': note})
+            tiles.append(tile(f'{sensor} {what}', text(number), of, note=note))
     return tiles
 
 

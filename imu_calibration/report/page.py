@@ -59,6 +59,11 @@ def in_unit(value: float, unit: str, digits: int = 3, *, quantity: str = '') -> 
     return text(value * factor, digits) + ('' if shown == '1' else f' {shown}')
 
 
+def tile(what: str, number: str, unit: str = '', *, before: str | None = None, note: str = '') -> dict[str, str | None]:
+    """Return one of the main figures at the head of a page, with its value before and a note."""
+    return {'what': what, 'number': number, 'unit': unit, 'before': before, 'note': note}
+
+
 SENSOR_TITLES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope', 'reference': 'Table and clock'}
 USE = {'exact': 'removed by compensation', 'flagged': 'cannot be removed, samples are marked',
        'none': 'belongs to the table or the session, not removed'}

@@ -15,7 +15,7 @@ from imu_calibration.kinematics.rotations import align
 from imu_calibration.planning.planner import Plan
 from imu_calibration.planning.repertoire import MotionKind
 from imu_calibration.report.figures import AXIS_COLOURS, FAINT, GREY, INK, Drawn, draw, log_axis
-from imu_calibration.report.page import render, text
+from imu_calibration.report.page import render, text, tile
 
 HALF_EDGES = np.array([1.0, 0.7, 0.3])
 """Half edges of the box along x, y, z: all different, so that attitudes are distinguishable."""
@@ -131,11 +131,11 @@ def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
     by_hand, count, bound = plan.start is None, int(plan.wanted.sum()), plan.lower_bound_seconds
     met = int((plan.sd <= plan.tolerances * (1 + 1e-6))[plan.wanted].sum())
-    tiles = [_tile('time', text(plan.seconds), 's', f'{len(plan.motions)} {plan.noun}'),
-             _tile('within tolerance', f'{met} of {count}', '', 'parameters')]
+    tiles = [tile('time', text(plan.seconds), 's', note=f'{len(plan.motions)} {plan.noun}'),
+             tile('within tolerance', f'{met} of {count}', note='parameters')]
     if not by_hand:
-        tiles.insert(1, _tile('least time', text(bound), 's', 'lower bound for plans of these motions') if np.isfinite(bound) else
-                     _tile('least time', 'not worked out', '', ''))
+        tiles.insert(1, tile('least time', text(bound), 's', note='lower bound for plans of these motions') if np.isfinite(bound) else
+                     tile('least time', 'not worked out'))
     sense = 'do the steps in this order, each by the turn that is named' if by_hand else _kinds(plan)
     if plan.missing:
         sense = f'out of reach {plan.scope}: {", ".join(plan.missing)}'
@@ -158,10 +158,6 @@ READING = ('The standard deviations are those that a calibration of this motion 
            'The least time is a lower bound: information is counted as if the biases of different windows were independent, and '
            'motions as if fractions of them and moves of zero length were possible. No plan made of the same motions '
            'is shorter.')
-
-
-def _tile(what, number, unit, note):
-    return {'what': what, 'number': number, 'unit': unit, 'before': '', 'note': note}
 
 
 def _kinds(plan):

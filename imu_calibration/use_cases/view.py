@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from imu_calibration.calibration.coverage import (
-    ARMS_TIMES,
-    ARROW,
     RADIUS,
     SEEN_DIAMETER,
     TEXT_COLOUR,
     VISITED,
     Coverage,
+    arrows_of,
     bars_of,
     cells_of,
     group_states,
@@ -230,13 +229,8 @@ def scene_of(coverage: Coverage, frame_id: str) -> Any:
         return found.ArrowPrimitive(pose=pose(start, _from_x(along / length)), shaft_length=0.8 * length, shaft_diameter=0.025,
                                     head_length=0.2 * length, head_diameter=0.05, color=color(rgb))
 
-    step, arms, center = coverage.next, np.zeros((0, 3)) if coverage.arms is None else coverage.arms, np.zeros(3)
     balls = [ball(*cell) for cell in cells_of(coverage)] + [ball(1.1 * RADIUS * up, VISITED, SEEN_DIAMETER) for up in coverage.seen]
-    arrows = [arrow(center, ARMS_TIMES * arm, rgb) for arm, rgb in zip(arms, 0.9 * np.eye(3), strict=False) if arm.any()]
-    if step.up is not None:
-        arrows.append(arrow(center, 1.25 * RADIUS * step.up, ARROW))
-    elif step.axis is not None:
-        arrows.append(arrow(-1.25 * RADIUS * step.axis, 2.5 * RADIUS * step.axis, ARROW))
+    arrows = [arrow(start, end - start, rgb) for _, start, end, rgb in arrows_of(coverage)]
     line = found.TextPrimitive(pose=pose((0.0, 0.0, 1.6 * RADIUS)), billboard=True, font_size=0.09, color=color(TEXT_COLOUR),
                                text=line_of(coverage))
     entity = found.SceneEntity(timestamp=found.Timestamp(0), frame_id=frame_id, id='coverage', spheres=balls, arrows=arrows, texts=[line])

@@ -145,7 +145,7 @@ def test_the_sd_of_a_plan_stays_below_the_tolerance_by_the_scatter_of_the_noise_
     assert np.mean(exceeded) < 0.1
     kept = [next(k for k, m in enumerate(situation.motions) if (m.kind, m.text) == (motion.kind, motion.text)
                  and np.array_equal(m.place, motion.place)) for motion in plan.motions]
-    cautious = situation.excess(situation.covariance_after(kept, 0, cautious=True)[0])
+    cautious = situation.coordinates.excess(situation.covariance_after(kept, 0, cautious=True)[0])
     assert cautious.max() <= 1 + 1e-6 and (plan.sd / plan.tolerances)[plan.wanted].max() < 0.98
 
 

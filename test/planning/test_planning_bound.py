@@ -51,7 +51,7 @@ def test_no_random_plan_that_meets_the_tolerances_is_shorter_than_the_bound(seed
     made, rng = situation(), np.random.default_rng(seed)
     bound = made.lower_bound()
     sequence, place = [], 0
-    while made.excess(made.covariance_after(sequence, place)[0]).max() > 1.0:
+    while made.coordinates.excess(made.covariance_after(sequence, place)[0]).max() > 1.0:
         sequence += list(rng.permutation(len(made.motions))[:2])
     assert made.covariance_after(sequence, place)[1] > bound > 0
 
