@@ -162,7 +162,7 @@ class SimulatorNode(Node):
                                  frame_id=settings.frame_id)
 
     def _publish_truth(self, model, values):
-        truth = true_calibration(model, values, self.settings.frame_id, {'seed': self.settings.seed})
+        truth = true_calibration(model, values, self.settings.frame_id, simulated={'seed': self.settings.seed})
         self._truth = self.create_publisher(String, '~/truth', latched_qos())
         self._truth.publish(String(data=calibration_to_text(truth)))
 

@@ -113,11 +113,11 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
     frame_id = table.imu_link if isinstance(table, Arm) and table.imu_link else LIKELY_LINK
     options = SimulationOptions(imu_rate, joint_rate, noise, frame_id=frame_id, temperature_start_c=25.0 if warm else None)
     samples = SampleBlock(*run_session(model, values, mover, profile=motion, options=options, seed=seed))
-    truth = true_calibration(model, values, options.frame_id, {'seed': seed, 'profile': profile})
+    truth = true_calibration(model, values, options.frame_id, simulated={'seed': seed, 'profile': profile})
     return Simulated(samples, mover, truth, motion.duration)
 
 
-def true_calibration(model: SensorModel, values: np.ndarray, frame_id: str, simulated: dict[str, Any]) -> Calibration:
+def true_calibration(model: SensorModel, values: np.ndarray, frame_id: str, *, simulated: dict[str, Any]) -> Calibration:
     """Return the exact calibration of a simulated IMU; `simulated` describes the simulation in its provenance."""
     return Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), frame_id,
                        {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': simulated}, **BY_DEFINITION)

@@ -12,6 +12,7 @@ from refusal import refused
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.estimation.solution import DETERMINED
+from imu_calibration.kinematics.joint_motion import rest_at
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.campaign import (
@@ -25,7 +26,7 @@ from imu_calibration.planning.campaign import (
     with_suspect,
 )
 from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
-from imu_calibration.planning.path_watch import PathWatch, at_rest
+from imu_calibration.planning.path_watch import PathWatch
 from imu_calibration.planning.situation import noise_of_grade
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
@@ -324,7 +325,7 @@ def test_no_limit_of_any_table_is_ever_exceeded_by_what_is_sent(seed, hurry):
     except InputError:
         assert driver.state is DriveState.IDLE and hurry > 1.0
         return
-    beyond, speed, acceleration = excess(trajectory_from(at_rest(start), sent), limits, step=0.001)
+    beyond, speed, acceleration = excess(trajectory_from(rest_at(start[None]), sent), limits, step=0.001)
     assert beyond < 1e-5 and speed < 1 + 1e-3 and acceleration < 1 + 1e-3
 
 
