@@ -9,10 +9,11 @@ from imu_calibration.calibration import collector
 from imu_calibration.calibration.collector import LiveCollector, columns_at, copied
 from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, GroupState, group_states, table_coverage, waiting_groups
 from imu_calibration.calibration.from_solution import Demand
-from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, LiveSnapshot, SessionStatus, TableSession
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, LiveSnapshot, TableSession
 from imu_calibration.calibration.table_calibration import conclude
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficients
@@ -278,5 +279,5 @@ class LiveCalibration:
             return waiting_groups(self.model) if self.model is not None else []
         return group_states(self.result)
 
-    def status(self, hints: dict[str, str] | None = None) -> SessionStatus | None:
+    def status(self, hints: dict[str, str] | None = None) -> LiveState | None:
         """Return None: the missing motions are in the groups."""

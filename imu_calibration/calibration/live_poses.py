@@ -10,8 +10,9 @@ import numpy as np
 from imu_calibration.calibration.coverage import Coverage, GroupState, group_states, waiting_groups
 from imu_calibration.calibration.hand_workflow import HandRecording, HandResult, evident_result
 from imu_calibration.calibration.pose_scan import NO_FINDINGS, hand_coverage, hand_status, look_for_poses
-from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SessionStatus, SolvePacer
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SolvePacer
 from imu_calibration.core.errors import InputError, NotObservableError
+from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.effects.sensor_model import BASE, SensorModel
@@ -223,8 +224,8 @@ class LiveByHand:
             self._shown = known, hand_coverage(self.found, self.result, hand_options(self.options), frame_id=self.frame_id)
         return self._shown[1]
 
-    def status(self, hints: dict[str, str] | None = None) -> SessionStatus:
-        """Return the SessionStatus: progress, and the pose or turn with the largest gain; `hints` as for `errors.with_hint`."""
+    def status(self, hints: dict[str, str] | None = None) -> LiveState:
+        """Return the LiveState: progress, and the pose or turn with the largest gain; `hints` as for `errors.with_hint`."""
         status = hand_status(self.found, self.result.calibration if self.result else None,
                              step=self.coverage().next.text, hints=hints)
         return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})

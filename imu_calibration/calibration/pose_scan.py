@@ -9,8 +9,8 @@ import numpy as np
 from imu_calibration.calibration.advice import HandKnowledge, foretold, knowledge_after, knowledge_at_first, ups_of
 from imu_calibration.calibration.coverage import DIRECTIONS, Coverage, Progress, Step
 from imu_calibration.calibration.hand_workflow import HandResult
-from imu_calibration.calibration.session import SessionStatus
 from imu_calibration.core.errors import with_hint
+from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.sensor_model import BASE, SensorModel
@@ -65,9 +65,9 @@ def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> Findings:
 
 
 def hand_status(found: Findings, calibration: Calibration | None, *, step: str,
-                hints: dict[str, str] | None = None) -> SessionStatus:
+                hints: dict[str, str] | None = None) -> LiveState:
     """
-    Return the SessionStatus.
+    Return the LiveState.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def hand_status(found: Findings, calibration: Calibration | None, *, step: str,
     if found.resting:
         parts.append(f'at rest for {found.resting:.1f} s: this pose counts, move on')
     parts += [f'next: {need}' for need in needs] if needs else ['all parameters are determined: save the calibration']
-    return SessionStatus(word, '; '.join(parts), values)
+    return LiveState(word, '; '.join(parts), values)
 
 
 def unseen(found: Findings) -> list[str]:

@@ -1,16 +1,17 @@
 """Common interface of live calibrations, and the snapshot that a worker solves."""
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import EvidentSolution, Solved, ask_kept, solve_by_evidence
-from imu_calibration.calibration.coverage import Coverage, GroupState, Progress
+from imu_calibration.calibration.coverage import Coverage, GroupState
 from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_calibration import solve_gathered, solve_in_passes
 from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.core.settings import setting
 from imu_calibration.effects.sensor_model import SensorModel
@@ -130,18 +131,6 @@ class SolvePacer:
         self._next = start + (end - start) / self._share
 
 
-@dataclass(frozen=True)
-class SessionStatus:
-    """Progress of a session, for the user."""
-
-    word: Progress
-    """WAITING before a solution is possible, WEAK while something is missing, or DETERMINED."""
-    message: str
-    """One line: the present state and the next step."""
-    values: dict[str, Any] = field(default_factory=dict)
-    """Figures by name."""
-
-
 class TableSession(Protocol):
     """Interface of a session on a table only."""
 
@@ -216,7 +205,7 @@ class LiveSession(Protocol):
     def groups(self) -> list[GroupState]:
         """Return the state of each effect."""
 
-    def status(self, hints: dict[str, str] | None = None) -> SessionStatus | None:
+    def status(self, hints: dict[str, str] | None = None) -> LiveState | None:
         """Return the progress of the session in addition to `groups`, or None; `hints` as for `errors.with_hint`."""
 
     def coverage(self) -> Coverage:

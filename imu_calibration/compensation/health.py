@@ -1,6 +1,6 @@
 """Health of a compensated stream: bias at stops, range, temperature."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from imu_calibration.compensation.compensate import FittedErrors, Transfer
 from imu_calibration.compensation.covariance import Uncertainty
+from imu_calibration.core.progress import LiveState
 from imu_calibration.core.units import DEG, GRAVITY_PLACE_SHARE, STANDARD_GRAVITY, unit_of_rest
 from imu_calibration.kinematics.rotations import EARTH_RATE
 
@@ -243,18 +244,6 @@ WAITING, HOLDS, MOVED, FOLLOWED, HARMS, UNIT = HealthWord
 
 
 @dataclass(frozen=True)
-class HealthState:
-    """Result of the last stop."""
-
-    word: HealthWord
-    """Whether the calibration holds."""
-    message: str
-    """One line of text."""
-    values: dict = field(default_factory=dict)
-    """Figures by name, with units."""
-
-
-@dataclass(frozen=True)
 class HealthOptions:
     """Site of the robot, and permitted corrections."""
 
@@ -326,9 +315,9 @@ class CalibrationHealth:
         self._last = _Judged(stop, of_mean, self.n_stops, None if self.update is None else self.update.predict(stop.end))
 
     @property
-    def state(self) -> HealthState:
+    def state(self) -> LiveState:
         """Result of the last stop, computed on request."""
-        return HealthState(WAITING, 'no stop of two seconds yet') if self._last is None else self._told(*self._last)
+        return LiveState(WAITING, 'no stop of two seconds yet') if self._last is None else self._told(*self._last)
 
     def _told(self, stop, of_mean, n_stops, bias_update):
         total = self._known + np.diag(of_mean)
@@ -344,7 +333,7 @@ class CalibrationHealth:
                   'gravity off [sd]': f'{force_off:.1f}'}
         measured_length, measured_rate = (float(np.linalg.norm(stop.others[part])) for part in (slice(3), slice(3, 6)))
         if unit := unit_of_rest(measured_length):
-            return HealthState(UNIT, f'the measured specific force at rest is {measured_length:.4g}: the unit is {unit}, it must be m/s^2; '
+            return LiveState(UNIT, f'the measured specific force at rest is {measured_length:.4g}: the unit is {unit}, it must be m/s^2; '
                                      'correct the driver', values)
         lines = []
         if rate_off[axis] > LIMIT:
@@ -359,15 +348,15 @@ class CalibrationHealth:
                        'bias update, sd [deg/s]': ', '.join(f'{value / DEG:.4f}' for value in np.sqrt(variance))}
         if not lines:
             off = f'{rate_off.max():.1f} and {force_off:.1f} sd'
-            return HealthState(HOLDS, f'the calibration holds: at the last stop rate and gravity were off by {off}', values)
+            return LiveState(HOLDS, f'the calibration holds: at the last stop rate and gravity were off by {off}', values)
         harms = (rate_off[axis] > LIMIT and np.linalg.norm(rate) > WORSE * measured_rate) or (
             force_off > LIMIT and abs(length - self._gravity) > WORSE * abs(measured_length - self._gravity) + LIMIT * gravity_sd)
         if harms:
-            return HealthState(HARMS, '; '.join(lines) + ': without the calibration it would be less; is it the right one? calibrate again',
+            return LiveState(HARMS, '; '.join(lines) + ': without the calibration it would be less; is it the right one? calibrate again',
                                values)
         if bias_update is not None and force_off <= LIMIT:
-            return HealthState(FOLLOWED, '; '.join(lines) + ': corrected as long as stops confirm it', values)
-        return HealthState(MOVED, '; '.join(lines) + ': calibrate again, unless it turned slowly and steadily there', values)
+            return LiveState(FOLLOWED, '; '.join(lines) + ': corrected as long as stops confirm it', values)
+        return LiveState(MOVED, '; '.join(lines) + ': calibrate again, unless it turned slowly and steadily there', values)
 
 
 SIX = tuple[float, ...]

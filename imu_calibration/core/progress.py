@@ -1,9 +1,23 @@
-"""Progress of long work: the core reports phases, the command line shows them; without a listener a report has no effect."""
+"""Progress of long work and states for the user: the core reports phases, which have no effect without a listener."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TypeVar
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+
+@dataclass(frozen=True)
+class LiveState:
+    """State of one part of a live system, for the user."""
+
+    word: str
+    """One of a few words of that part."""
+    message: str
+    """One line: the state and the remedy or next step."""
+    values: dict[str, Any] = field(default_factory=dict)
+    """Figures by name."""
+
 
 Item = TypeVar('Item')
 Listener = Callable[[str, float, float], None]

@@ -25,8 +25,7 @@ from imu_calibration.calibration.coverage import (
     line_of,
 )
 from imu_calibration.calibration.diagnosis import live_diagnosis as diagnosis
-from imu_calibration.calibration.diagnosis.live_diagnosis import DiagnosisState
-from imu_calibration.calibration.session import SessionStatus
+from imu_calibration.core.progress import LiveState
 from imu_calibration.document.decision import HARMS
 from imu_calibration.nodes.complaints import LOG_INFO, LOG_WARN
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, make_status
@@ -57,9 +56,9 @@ class WorkerState:
     """Windows, or poses by hand."""
     values: dict = field(default_factory=dict)
     """Figures by name."""
-    session: SessionStatus | None = None
+    session: LiveState | None = None
     """Progress in addition to the parameter groups: the poses of a calibration by hand."""
-    diagnosis: DiagnosisState | None = None
+    diagnosis: LiveState | None = None
     """Detected model errors; None without a table."""
     place: str = ''
     """Where the calibration is saved."""

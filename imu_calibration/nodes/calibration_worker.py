@@ -11,10 +11,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from imu_calibration.calibration.coverage import bars_of
-from imu_calibration.calibration.diagnosis.live_diagnosis import DiagnosisState, question_about
+from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSession, LiveSettings, SolvePacer
 from imu_calibration.core.errors import ImuCalibrationError, NotObservableError, shortened
+from imu_calibration.core.progress import LiveState
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.trust import missing
 from imu_calibration.nodes.calibration_status import WorkerState
@@ -287,6 +288,6 @@ class CalibrationWorker(threading.Thread):
             self._covered = seen
             self.listeners.coverage(replace(self.live.coverage(), bars=bars_of(self.state.groups)))
 
-    def _diagnosis_state(self) -> DiagnosisState:
+    def _diagnosis_state(self) -> LiveState:
         state = self._diagnosis.state
         return replace(state, values={**state.values, 'diagnoses': self._diagnosis.n_answers, 'being made': self._diagnosis.is_running})

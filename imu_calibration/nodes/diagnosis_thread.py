@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from imu_calibration.calibration.diagnosis.live_diagnosis import FAILED, OFF, Answer, DiagnosisQuestion, DiagnosisState
+from imu_calibration.calibration.diagnosis.live_diagnosis import FAILED, NOT_YET, OFF, Answer, DiagnosisQuestion
 from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.session import SolvePacer
-from imu_calibration.core.progress import listening
+from imu_calibration.core.progress import LiveState, listening
 from imu_calibration.selection.reduced_recording import REDUCING
 
 THRESHOLD = 256 * 1024
@@ -84,7 +84,7 @@ class DiagnosisThread:
         self.period, self._pacer, self._ending = period, SolvePacer(MAX_DIAGNOSIS_SHARE), False
         self._thread: threading.Thread | None = None
         self._next, self._wanted, self._urgent = time.monotonic() + period, False, False
-        self.state = DiagnosisState() if period else DiagnosisState(OFF, OFF_WHY)
+        self.state = NOT_YET if period else LiveState(OFF, OFF_WHY)
         self.n_answers, self._session = 0, 0
         self._answered: dict | None = None   # numbers of samples of the last question; the question itself keeps all windows in memory
         self._demand: Demand | None = None
@@ -92,7 +92,7 @@ class DiagnosisThread:
     def change(self, period: float) -> None:
         """Use another period; 0: no more diagnoses."""
         if bool(period) != bool(self.period):
-            self.state = DiagnosisState() if period else DiagnosisState(OFF, OFF_WHY)
+            self.state = NOT_YET if period else LiveState(OFF, OFF_WHY)
         self.period, self._next = period, time.monotonic() + period
 
     @property
@@ -106,7 +106,7 @@ class DiagnosisThread:
 
     def forget(self) -> None:
         """Discard all results: the session is restarted."""
-        self.state, self._wanted, self._urgent = DiagnosisState() if self.period else self.state, False, False
+        self.state, self._wanted, self._urgent = NOT_YET if self.period else self.state, False, False
         self._answered = self._demand = None
         self._session += 1
 
@@ -130,7 +130,7 @@ class DiagnosisThread:
         except _Ended:
             return
         except Exception as error:   # a diagnosis that fails must not end the calibration
-            answer = Answer(DiagnosisState(FAILED, f'the diagnosis failed: {type(error).__name__}: {error}'))
+            answer = Answer(LiveState(FAILED, f'the diagnosis failed: {type(error).__name__}: {error}'))
         if session == self._session:
             self.state, self._demand, self._answered, self.n_answers = answer.state, answer.demand, question.samples, self.n_answers + 1
         del answer

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.preprocessing.stamping import IRREGULAR, StampLine
 from imu_calibration.preprocessing.stream_cleaning import MESSAGES
@@ -31,15 +32,9 @@ GOOD, TROUBLE, SILENT = StreamHealth
 
 
 @dataclass(frozen=True)
-class StreamState:
-    """The state of all streams together."""
+class StreamState(LiveState):
+    """The state of all streams together; `word` is a StreamHealth."""
 
-    word: StreamHealth
-    """How they are."""
-    message: str
-    """One line: the fault and the remedy."""
-    values: dict
-    """Figures by name."""
     silent: tuple = ()
     """Needed streams without messages: 'imu', 'joints', 'temperature'."""
     coming: tuple = ()

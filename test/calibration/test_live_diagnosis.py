@@ -9,12 +9,12 @@ from test_live_calibration import assert_same, blocks
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
-from imu_calibration.calibration.diagnosis.live_diagnosis import Answer, DiagnosisState, describe, question_about
+from imu_calibration.calibration.diagnosis.live_diagnosis import Answer, describe, question_about
 from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.session import LiveSettings
 from imu_calibration.core.errors import DocumentError
-from imu_calibration.core.progress import report
+from imu_calibration.core.progress import LiveState, report
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
@@ -206,7 +206,7 @@ class Slow:
         """Wait, look whether to go on, answer."""
         while not self.go.wait(0.01):
             report('waiting', 0.5, 1.0)
-        return Answer(DiagnosisState('found', self.words), Demand())
+        return Answer(LiveState('found', self.words), Demand())
 
     @property
     def samples(self):

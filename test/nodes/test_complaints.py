@@ -6,7 +6,7 @@ pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 
 from imu_calibration.calibration.coverage import GroupState  # noqa: E402
-from imu_calibration.calibration.diagnosis.live_diagnosis import DiagnosisState  # noqa: E402
+from imu_calibration.core.progress import LiveState  # noqa: E402
 from imu_calibration.nodes.calibration_status import (  # noqa: E402
     MIN_ADVICE_SECONDS,
     CalibrationGuide,
@@ -79,7 +79,7 @@ def test_the_guide_says_every_change_once(now):
               WorkerState(streams=counted, gathered=3, verdict='unproven', judged='unproven', lines=('bias: known less well', 'next: turn about x')),
               WorkerState(streams=counted, gathered=5, verdict='unproven', judged='unproven', lines=('bias: known less well', 'next: turn about y')),
               WorkerState(streams=counted, gathered=8, verdict='helps', judged='helps', complete=True, lines=('all is well',)),
-              WorkerState(streams=counted, gathered=8, verdict='helps', judged='helps', complete=True, diagnosis=DiagnosisState('found', 'the gyroscopes feel gravity', {'effect': 'g'})),
+              WorkerState(streams=counted, gathered=8, verdict='helps', judged='helps', complete=True, diagnosis=LiveState('found', 'the gyroscopes feel gravity', {'effect': 'g'})),
               WorkerState(streams=counted, gathered=9, verdict='harms', judged='harms', lines=('residuals are large',))]
     said = []
     for state in states:

@@ -1,6 +1,6 @@
 """A diagnosis during the motion: its input, a solution, and its outcome as a status."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
@@ -11,6 +11,7 @@ from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.calibration.from_solution import Demand
 from imu_calibration.calibration.session import LiveSnapshot, TableSession
 from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.progress import LiveState
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.investigation import too_few_windows
 
@@ -37,23 +38,15 @@ MATES_KEY, SIZE_KEY = 'mates of ', 'size of '
 WAITING, OFF, FOUND, NOTHING, UNEXPLAINED, FAILED = Outcome
 
 
-@dataclass(frozen=True)
-class DiagnosisState:
-    """Result of a diagnosis, or the reason why there is none."""
-
-    word: Outcome = WAITING
-    """Outcome."""
-    message: str = f'it follows a solution of at least {MIN_FOLD_WINDOWS} windows'
-    """One line."""
-    values: dict = field(default_factory=dict)
-    """Figures by name."""
+NOT_YET = LiveState(WAITING, f'it follows a solution of at least {MIN_FOLD_WINDOWS} windows')
+"""Before the first diagnosis."""
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
     """Outcome of a diagnosis, and its consequence for the calibration."""
 
-    state: DiagnosisState
+    state: LiveState
     """For display."""
     demand: Demand | None = None
     """Effects that the windows support; None where they could not be tested."""
@@ -81,7 +74,7 @@ class DiagnosisQuestion:
             del evidence   # its columns, of a wider model than those of the session, need much memory
             return Answer(describe(told(self.snapshot.table, found, calibrated=calibrated)), demand)
         except ImuCalibrationError as error:
-            return Answer(DiagnosisState(WAITING, str(error)))
+            return Answer(LiveState(WAITING, str(error)))
 
 
 def question_about(live: TableSession | None) -> DiagnosisQuestion | None:
@@ -89,14 +82,14 @@ def question_about(live: TableSession | None) -> DiagnosisQuestion | None:
     return DiagnosisQuestion(live.last) if live is not None and live.last is not None and windows_to_ask(live.last.gathered) else None
 
 
-def describe(diagnosis: Diagnosis) -> DiagnosisState:
-    """Return the DiagnosisState of a Diagnosis: the first finding, or none, or the unexplained residual."""
+def describe(diagnosis: Diagnosis) -> LiveState:
+    """Return the LiveState of a Diagnosis: the first finding, or none, or the unexplained residual."""
     values: dict[str, Any] = {'windows': diagnosis.windows, 'windows held out for the gain': diagnosis.locked}
     rest = [line for line in diagnosis_lines(diagnosis) if line.startswith('unexplained')]
     values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor, found.unit)
                for sensor, found in diagnosis.unexplained.items() if found.significant}
     if not diagnosis.findings:
-        return DiagnosisState(UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing_named(diagnosis), values)
+        return LiveState(UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing_named(diagnosis), values)
     first = diagnosis.findings[0]
     message = f'{first.title}: {first.explanation}'
     if first.indistinguishable_from:
@@ -115,4 +108,4 @@ def describe(diagnosis: Diagnosis) -> DiagnosisState:
         values[MATES_KEY + finding.effect] = ' '.join(finding.indistinguishable_from)
         sized = {finding.effect: finding.parameters, **finding.sizes_of_mates}
         values |= {f'{SIZE_KEY}{effect}.{name}': repr(float(size)) for effect, sizes in sized.items() for name, (size, *_) in sizes.items()}
-    return DiagnosisState(FOUND, message, values)
+    return LiveState(FOUND, message, values)
