@@ -9,6 +9,7 @@ from functools import partial
 from itertools import islice
 from os import PathLike
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -196,6 +197,8 @@ SCHEMA_STATEMENTS = (
 
 PAGE_SIZE = 16384
 """Bytes; SQLite writes and balances fewer pages than with its default of 4096."""
+INSERTED_ROWS = 256
+"""Rows per statement; SQLite finds the end of the table once for all of them. Older versions allow 999 values."""
 
 
 class SqliteWriter:
@@ -224,8 +227,12 @@ class SqliteWriter:
 
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
-        self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)',
-                                    zip(topic_ids.tolist(), received_ns.tolist(), messages.copies(), strict=True))
+        values: list[Any] = [None] * (3 * len(messages))
+        values[0::3], values[1::3], values[2::3] = topic_ids.tolist(), received_ns.tolist(), messages.copies()
+        whole = len(messages) // INSERTED_ROWS * INSERTED_ROWS
+        for start, stop, rows in ((0, whole, INSERTED_ROWS), (whole, len(messages), 1)):
+            self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES ' + ', '.join(['(?, ?, ?)'] * rows),
+                                        (values[3 * k:3 * (k + rows)] for k in range(start, stop, rows)))
 
     def close(self, metadata_version: int, metadata: str) -> None:
         """Add the index by time and the metadata, and close."""
