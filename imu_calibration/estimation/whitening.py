@@ -221,7 +221,10 @@ class RestrictedLikelihood:
         left = solve_triangular(factor[:-1, :-1], white[:, :-1].T, trans='T').T
         rest = white[:, -1] - left @ factor[:-1, -1]
         redundancy = 1 - np.einsum('ij,ij->i', left, left)
-        return 0.5 * weighted @ (rest**2 - redundancy), 0.5 * weighted @ (np.eye(len(left)) - left @ left.T)**2 @ weighted.T
+        spread = left @ left.T
+        spread[np.diag_indices_from(spread)] -= 1
+        np.square(spread, out=spread)   # in place: the square of the number of rows
+        return 0.5 * weighted @ (rest**2 - redundancy), 0.5 * weighted @ spread @ weighted.T
 
 
 def eliminate(normal: np.ndarray, count: int) -> tuple[float, np.ndarray]:
