@@ -22,7 +22,7 @@ from msg_adapters.layout import Packed, clean_name
 from msg_adapters.mcap_records import LARGEST_CHUNK, decompress
 from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.storage import RawMessages
-from msg_adapters.storages import BagSource, suffixes
+from msg_adapters.storages import suffixes
 
 DESCRIPTION_TOPIC = '/robot_description'
 STRING_TYPE = 'std_msgs/msg/String'
@@ -146,7 +146,7 @@ def open_recording(path: str | PathLike[str], imu_topic: str | None = None, join
 class Recording:
     """An open bag; use it as a context manager or call `close`."""
 
-    def __init__(self, path: Path, source: BagSource, topics: tuple[Topic, ...], *, imu_topic: str, joint_topic: str | None,
+    def __init__(self, path: Path, source: 'Rosbag2 | Ros1File', topics: tuple[Topic, ...], *, imu_topic: str, joint_topic: str | None,
                  temperature_topic: str | None, frame_id: str | None = None):
         self.path = path
         self.topics = topics

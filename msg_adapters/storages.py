@@ -1,38 +1,10 @@
 """The storages of rosbag2 that are read and written: to add one, add its entry to `STORAGES`."""
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 from msg_adapters.mcap_file import McapFile, McapWriter
 from msg_adapters.sqlite_file import SqliteFile, SqliteWriter
-from msg_adapters.storage import RawMessages
-
-
-class BagSource(Protocol):
-    """The messages of one recording, independent of its file format: `rosbag2.Rosbag2` or `bag.Ros1File`."""
-
-    ros1: bool
-    """Whether the messages are serialized as in ROS 1."""
-    types: dict[str, str]
-    """Topic -> message type."""
-    definitions: dict[str, tuple[str, str]]
-    """Message type -> (encoding, text) of its definition."""
-    counts: dict[str, int]
-    """Topic -> number of messages by the recording's metadata."""
-
-    @property
-    def lost(self) -> dict[str, int]:
-        """Unreadable data, reason -> count."""
-
-    @property
-    def duration_ns(self) -> int:
-        """Time between the first and the last message by the clock of the recorder."""
-
-    def stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
-        """Yield RawMessages of the topics in file order."""
-
-    def close(self) -> None:
-        """Close the files."""
 
 
 class Storage(NamedTuple):

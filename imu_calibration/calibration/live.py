@@ -9,7 +9,7 @@ from imu_calibration.calibration import collector
 from imu_calibration.calibration.collector import LiveCollector, columns_at, copied
 from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, GroupState, group_states, table_coverage, waiting_groups
 from imu_calibration.calibration.from_solution import Demand
-from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, LiveSnapshot, TableSession
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, LiveSnapshot
 from imu_calibration.calibration.table_calibration import conclude
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import InputError
@@ -118,7 +118,7 @@ class LiveCalibration:
             self.options = replace(self.options, windows=settings)
 
     @property
-    def on_table(self) -> TableSession:
+    def on_table(self) -> 'LiveCalibration':
         """The session itself: model errors can be diagnosed while it runs."""
         return self
 

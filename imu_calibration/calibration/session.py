@@ -1,25 +1,17 @@
 """Common interface of live calibrations, and the snapshot that a worker solves."""
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import EvidentSolution, Solved, ask_kept, solve_by_evidence
-from imu_calibration.calibration.coverage import Coverage, GroupState
 from imu_calibration.calibration.from_solution import Demand
-from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_calibration import solve_gathered, solve_in_passes
-from imu_calibration.calibration.table_result import TableResult
-from imu_calibration.core.progress import LiveState
-from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.core.settings import setting
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import local_gravity
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.joint_checks import check_units
-from imu_calibration.preprocessing.stamping import StampLine
-from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.references.turntable.gathered import Gathered, WindowStore
 
@@ -129,87 +121,3 @@ class SolvePacer:
     def note(self, start: float, end: float) -> None:
         """Record a solution that was computed from `start` to `end`."""
         self._next = start + (end - start) / self._share
-
-
-class TableSession(Protocol):
-    """Interface of a session on a table only."""
-
-    table: Table
-    """The reference."""
-    options: CalibrationOptions
-    """Options of the estimate."""
-    last: LiveSnapshot | None
-    """The data of the last solution."""
-
-    def adopt(self, demand: Demand) -> bool:
-        """Add the effects that the session supports to the model from now on; return whether the model changes."""
-
-    @property
-    def result(self) -> TableResult | None:
-        """The last solution."""
-
-
-class LiveSession(Protocol):
-    """A calibration during the motion: `push` for new blocks, `solve` when it is due."""
-
-    settings: LiveSettings
-    """Solving interval, storage and published data; may be replaced."""
-    observations: str
-    """Unit of the gathered data, for the user: 'windows' or 'poses'."""
-    needs_joints: bool
-    """Whether it waits for joint states."""
-
-    @property
-    def result(self) -> CalibrationResult | None:
-        """The last solution."""
-
-    @property
-    def on_table(self) -> TableSession | None:
-        """The session itself if a table is the reference, for a diagnosis; None by hand."""
-
-    @property
-    def needs_temperature(self) -> bool:
-        """Whether it waits for temperatures."""
-
-    @property
-    def n_windows(self) -> int:
-        """Windows or poses gathered so far, those of an earlier run included."""
-
-    @property
-    def frame_id(self) -> str:
-        """Frame of the sensor; '' before the first message."""
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Samples by their use."""
-
-    @property
-    def stamping(self) -> StampLine | None:
-        """How the stamps of the IMU are; None while that is not known."""
-
-    def push(self, block: SampleBlock) -> list:
-        """Process a block and return the windows or poses that it completed."""
-
-    def residuals(self, completed: list) -> ImuSamples | None:
-        """Return measured minus predicted values of the windows or poses from `push`, or None before the first solution."""
-
-    def solve(self, pending: bool = False, provenance: dict | None = None) -> CalibrationResult:
-        """Solve the gathered data; with `pending`, include open windows or poses as if the motion ended now."""
-
-    def needs_linearising(self) -> bool:
-        """Return whether the result is not final because data for another linearisation are no longer kept."""
-
-    def saved(self, pending: bool = False) -> bytes:
-        """Return the gathered data as bytes, for another run."""
-
-    def groups(self) -> list[GroupState]:
-        """Return the state of each effect."""
-
-    def status(self, hints: dict[str, str] | None = None) -> LiveState | None:
-        """Return the progress of the session in addition to `groups`, or None; `hints` as for `errors.with_hint`."""
-
-    def coverage(self) -> Coverage:
-        """Return the gain of further attitudes, and the next step."""
-
-    def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
-        """Use other settings from now on."""

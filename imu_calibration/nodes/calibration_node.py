@@ -19,7 +19,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from imu_calibration.calibration.session import LiveByHandSettings, LiveSession, LiveSettings
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
@@ -32,7 +32,7 @@ from imu_calibration.nodes.inputs import BatchInput, latched_qos, output_qos, wa
 from imu_calibration.nodes.lifecycle import announce, run_node
 from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of, words_of
-from imu_calibration.nodes.session_files import SessionFiles, reference_of
+from imu_calibration.nodes.session_files import LiveSession, SessionFiles, reference_of
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.provenance import provenance_with

@@ -9,18 +9,19 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 from imu_calibration.calibration.coverage import bars_of
 from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.result import CalibrationResult, summary
-from imu_calibration.calibration.session import LiveByHandSettings, LiveSession, LiveSettings, SolvePacer
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SolvePacer
 from imu_calibration.core.errors import ImuCalibrationError, NotObservableError, shortened
 from imu_calibration.core.progress import LiveState
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.trust import missing
 from imu_calibration.nodes.calibration_status import WorkerState
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread, Listeners, Request, return_freed_memory
-from imu_calibration.nodes.session_files import SessionFiles
+from imu_calibration.nodes.session_files import LiveSession, SessionFiles
 from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.preprocessing.window import WindowSettings
 from msg_adapters.live import LiveGatherer
@@ -138,7 +139,7 @@ class CalibrationWorker(threading.Thread):
         self._looked = time.monotonic()
         block = self.gatherer.flush()
         self._watch.note(block, self._looked)
-        windows = self.live.push(block)
+        windows: Any = self.live.push(block)   # of the kind that the session itself reads
         if block.imu is not None or block.joints is not None:
             self._closed = False
         if windows:

@@ -44,9 +44,9 @@ from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node
 from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
-from imu_calibration.planning.campaign import Campaign, CampaignSettings, MotionPlanner, Suspect, separator_of
+from imu_calibration.planning.campaign import Campaign, CampaignSettings, Suspect, separator_of
 from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
-from imu_calibration.planning.planner import make_planner
+from imu_calibration.planning.planner import Planner, make_planner
 from imu_calibration.planning.repertoire import up_at
 from imu_calibration.planning.situation import expected_noise, require_grade
 from imu_calibration.references.options import CalibrationOptions
@@ -175,7 +175,7 @@ class PlannerNode(Node):
                         first=lambda position: planner.probe(position, self.driver.first_reach),
                         unwind=planner.unwinding)
 
-    def _make_separator(self, suspect: Suspect, noise: dict) -> MotionPlanner:
+    def _make_separator(self, suspect: Suspect, noise: dict) -> Planner:
         calibration = self._latest()
         if calibration is None:
             raise InputError('a calibration is required before causes can be separated, none was received; publish imu/calibration')

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.live_poses import LiveByHand
-from imu_calibration.calibration.session import LiveByHandSettings, LiveSession, LiveSettings
+from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.core.errors import ImuCalibrationError, shortened
 from imu_calibration.document import files
 from imu_calibration.kinematics.joint import JointNames
@@ -16,6 +16,8 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 
 DEFAULT_FILE = 'calibration.yaml'
+LiveSession = LiveCalibration | LiveByHand
+"""A calibration during the motion, on a table or by hand."""
 
 
 class SessionFiles:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -138,21 +138,6 @@ MAX_REMAINING_SHARE = 0.93
 """Largest share of the logarithms of excess over tolerance that may remain after them; otherwise further motions do not pay."""
 
 
-class MotionPlanner(Protocol):
-    """Interface of a planner (`planning.planner.Planner`)."""
-
-    @property
-    def excess(self) -> dict[str, float]:
-        """Standard deviation over tolerance of each requested parameter."""
-
-    def take(self, calibration: Any) -> None:
-        """Replace the predicted information by the measured information."""
-
-    def next_motion(self, position: np.ndarray) -> Any:
-        """Return the NextMotion from where the joints are, and count on it."""
-
-
-
 @dataclass(frozen=True)
 class CampaignSettings:
     """When to end."""
@@ -193,7 +178,7 @@ class Campaign:
 
     Parameters
     ----------
-    planner : MotionPlanner
+    planner : Planner
     settings : CampaignSettings
     make_separator : callable, optional
         Returns a planner of motions that separate a Suspect from its mates, or raises an ImuCalibrationError if none exists.
@@ -204,13 +189,13 @@ class Campaign:
 
     """
 
-    def __init__(self, planner: MotionPlanner, settings: CampaignSettings = CampaignSettings(),
-                 make_separator: Callable[[Suspect], MotionPlanner] | None = None, *,
+    def __init__(self, planner: Planner, settings: CampaignSettings = CampaignSettings(),
+                 make_separator: Callable[[Suspect], Planner] | None = None, *,
                  first: Callable[[np.ndarray], Any] = lambda position: None,
                  unwind: Callable[[np.ndarray], Any] = lambda position: None):
         self.planner, self.settings, self._make_separator, self._unwind = planner, settings, make_separator, unwind
         self._first: Callable[[np.ndarray], Any] | None = first
-        self._separator: MotionPlanner | None = None
+        self._separator: Planner | None = None
         self.findings: list[Suspect] | None = None
         """Findings of the last diagnosis, the strongest first; None before the first diagnosis."""
         self.separations = 0

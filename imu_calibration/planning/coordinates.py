@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import scipy.linalg
@@ -117,19 +116,6 @@ SEPARATION_PROBABILITY = 0.95
 """Probability with which causes are to be separated."""
 
 
-class Goal(Protocol):
-    """Requirement on the covariance of z."""
-
-    words: str
-    """The causes to be separated, if that is the goal."""
-
-    def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
-        """Return the distance of covariances, shape (k, n, n), with roots enlarged by `margin`, from the goal, shape (k,); zero at it."""
-
-    def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
-        """Return the names of unmet requirements with one covariance, shape (n, n)."""
-
-
 class WithinTolerances:
     """Every requested parameter within its tolerance: ``sum_i w_i max(0, ln(sd_i / tolerance_i))``, all weights 1 unless given."""
 
@@ -216,6 +202,10 @@ class ToldApart:
         found = self.noncentrality(covariance[None])[0]
         return tuple(dict.fromkeys(' and '.join(sorted((a.key[1], b.key[1])))
                                    for (a, b), value in zip(self.pairs, found, strict=True) if value < 1.0))
+
+
+Goal = WithinTolerances | ToldApart
+"""Requirement on the covariance of z."""
 
 
 def enough(size: int, questions: int) -> float:

@@ -9,7 +9,8 @@ from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines, in_words, nothing_named
 from imu_calibration.calibration.diagnosis.table_diagnosis import told
 from imu_calibration.calibration.from_solution import Demand
-from imu_calibration.calibration.session import LiveSnapshot, TableSession
+from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.session import LiveSnapshot
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.progress import LiveState
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
@@ -77,7 +78,7 @@ class DiagnosisQuestion:
             return Answer(LiveState(WAITING, str(error)))
 
 
-def question_about(live: TableSession | None) -> DiagnosisQuestion | None:
+def question_about(live: LiveCalibration | None) -> DiagnosisQuestion | None:
     """Return the DiagnosisQuestion about the last solution of a session, or None without a table or while there are too few windows."""
     return DiagnosisQuestion(live.last) if live is not None and live.last is not None and windows_to_ask(live.last.gathered) else None
 
