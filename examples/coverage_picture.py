@@ -9,7 +9,7 @@ from builtin_interfaces.msg import Time
 from visualization_msgs.msg import Marker
 
 from imu_calibration.calibration.advice import foretold
-from imu_calibration.calibration.coverage import DIRECTIONS, Bar, Coverage, Step
+from imu_calibration.calibration.coverage import DIRECTIONS, Coverage, Step
 from imu_calibration.calibration.hand_step import HandStep
 from imu_calibration.calibration.pose_scan import NO_FINDINGS, knowledge_of
 from imu_calibration.nodes.calibration_status import markers_of
@@ -30,8 +30,7 @@ def states():
         seen.append(step.up)
     yield shown(knowledge, seen)
     seen += [step.up for step in foretold(knowledge)]
-    done = (Bar('accelerometer bias', 0.5, 'determined'),)
-    yield Coverage(np.zeros(len(DIRECTIONS)), np.array(seen), seen[-1], Step(''), 0.0, done)
+    yield Coverage(np.zeros(len(DIRECTIONS)), np.array(seen), seen[-1], Step(''), 0.0, done=True)
 
 
 def shown(knowledge, seen):

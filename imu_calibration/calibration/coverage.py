@@ -88,18 +88,6 @@ MAX_MOTION_SECONDS = 300.0
 """s; longer standard motions gain too little per second, and their computation is slow."""
 
 
-@dataclass(frozen=True)
-class Bar:
-    """One parameter group in units of its tolerance."""
-
-    name: str
-    """SENSOR EFFECT."""
-    ratio: float
-    """Largest standard deviation over tolerance; NaN before the first solution."""
-    status: str
-    """'waiting', 'held', 'weak' or 'determined'."""
-
-
 @dataclass(frozen=True, eq=False)
 class Step:
     """The next step."""
@@ -128,26 +116,21 @@ class Coverage:
     """The next step."""
     seconds: float
     """Remaining time, s; NaN when unknown."""
-    bars: tuple[Bar, ...] = ()
-    """Every parameter group."""
+    done: bool = False
+    """Whether every parameter group is determined."""
     arms: np.ndarray | None = None
     """Sensitive points of the accelerometer's axes, m in the sensor frame, rows x, y, z, shape (3, 3); None while they are not known."""
     frame_id: str = ''
     """Frame of the sensor."""
-
-    @property
-    def done(self) -> bool:
-        """Whether every group is determined."""
-        return bool(self.bars) and all(bar.status == DETERMINED for bar in self.bars)
 
 
 NOTHING_SEEN = Coverage(np.ones(len(DIRECTIONS)), np.zeros((0, 3)), None, Step('move the table'), float('nan'))
 """Before anything is known."""
 
 
-def bars_of(groups: Sequence[GroupState]) -> tuple[Bar, ...]:
-    """Return a Bar for every group of parameters."""
-    return tuple(Bar(f'{group.sensor} {group.effect}', group.sd / group.tolerance, str(group.status)) for group in groups)
+def all_determined(groups: Sequence[GroupState]) -> bool:
+    """Return whether every group is determined; False without groups."""
+    return bool(groups) and all(group.status == DETERMINED for group in groups)
 
 
 def excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
@@ -197,7 +180,7 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     step = _next_on_table(result) if first is None else _step(first.text)
     errors = result.window_errors()
     force = errors.true['accelerometer'][np.asarray(errors.kind) == 'static']
-    return Coverage(worth, force / np.linalg.norm(force, axis=1, keepdims=True), None, step, seconds, (), _arms(result), frame_id)
+    return Coverage(worth, force / np.linalg.norm(force, axis=1, keepdims=True), None, step, seconds, False, _arms(result), frame_id)
 
 
 def _foretold(information, left, added, motions):

@@ -60,8 +60,6 @@ class WorkerState:
     """Progress in addition to the parameter groups: the poses of a calibration by hand."""
     diagnosis: LiveState | None = None
     """Detected model errors; None without a table."""
-    place: str = ''
-    """Where the calibration is saved."""
     judged: str = ''
     """The decisions in one phrase."""
     complete: bool = False

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from imu_calibration.calibration.coverage import bars_of
+from imu_calibration.calibration.coverage import all_determined
 from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SolvePacer
@@ -75,7 +75,7 @@ class CalibrationWorker(threading.Thread):
         self._trouble = ''
         self._faults: dict[str, str] = {}
         self._note_fault('place', self.place.try_place())
-        self.state = WorkerState(groups=self.live.groups(), place=str(self.place.calibration))
+        self.state = WorkerState(groups=self.live.groups())
 
     @property
     def gathered(self) -> str:
@@ -279,15 +279,14 @@ class CalibrationWorker(threading.Thread):
         diagnosis = self._diagnosis_state() if self.live.on_table is not None else None
         self.state = WorkerState(groups, self._watch.state(self._looked), self._n_solutions, verdict, tuple(lines), self._trouble,
                                  tuple(line for line in self._faults.values() if line), self.live.n_windows, values,
-                                 self.live.status(self.hints), diagnosis,
-                                 str(self.place.calibration), judged, complete)
+                                 self.live.status(self.hints), diagnosis, judged, complete)
 
     def _cover(self) -> None:
         """Update the picture of the coverage after a change."""
         seen = (id(self.live), self.live.n_windows if self.live.on_table is None else 0, self._n_solutions)
         if seen != self._covered:
             self._covered = seen
-            self.listeners.coverage(replace(self.live.coverage(), bars=bars_of(self.state.groups)))
+            self.listeners.coverage(replace(self.live.coverage(), done=all_determined(self.state.groups)))
 
     def _diagnosis_state(self) -> LiveState:
         state = self._diagnosis.state

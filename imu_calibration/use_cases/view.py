@@ -17,8 +17,8 @@ from imu_calibration.calibration.coverage import (
     TEXT_COLOUR,
     VISITED,
     Coverage,
+    all_determined,
     arrows_of,
-    bars_of,
     cells_of,
     group_states,
     line_of,
@@ -404,4 +404,4 @@ def _coverage(result: CalibrationResult) -> Coverage:
     else:
         assert isinstance(result, TableResult), 'a calibration is made by hand or on a table'
         found = table_coverage(result)
-    return replace(found, bars=bars_of(group_states(result)))
+    return replace(found, done=all_determined(group_states(result)))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.advice import WEIGHTS, _rollout, foretold
-from imu_calibration.calibration.coverage import DIRECTIONS, MIN_CELL_WORTH, Bar, Coverage, Step, line_of, table_coverage
+from imu_calibration.calibration.coverage import DIRECTIONS, MIN_CELL_WORTH, Coverage, Step, line_of, table_coverage
 from imu_calibration.calibration.hand_step import HandStep, direction_words, shortest_turn
 from imu_calibration.calibration.live_poses import LiveByHand
 from imu_calibration.calibration.pose_scan import NO_FINDINGS, hand_coverage, knowledge_of
@@ -199,7 +199,7 @@ def test_markers_carry_frame_cells_arrow_and_time():
 
 
 def test_when_all_is_done_every_cell_is_green_and_the_text_says_so():
-    done = Coverage(np.zeros(26), np.eye(3), np.eye(3)[0], Step(''), 0.0, (Bar('accelerometer bias', 0.5, 'determined'),), 0.01 * np.eye(3))
+    done = Coverage(np.zeros(26), np.eye(3), np.eye(3)[0], Step(''), 0.0, True, 0.01 * np.eye(3))
     made = picture(done)
     assert made['text'][0].text == line_of(done) and 'next' not in made and len(made['arms']) == 3
     assert len({(m.color.r, m.color.g, m.scale.x) for m in made['cells']}) == 1 and made['cells'][0].color.g > made['cells'][0].color.r
