@@ -11,11 +11,11 @@ import numpy as np
 
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY, for_people, significant, with_sd
-from imu_calibration.document.decision import SensorDecision, Verdict, decide, decisions_text, most_cautious
+from imu_calibration.document.decision import BY_DEFINITION, SensorDecision, Verdict, decide, decisions_text, most_cautious
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.covariance_terms import GRAVITY
-from imu_calibration.estimation.solution import COMMON_SCALE, FIXED, HELD, Status
+from imu_calibration.estimation.solution import COMMON_SCALE, DETERMINED, FIXED, HELD, Status
 
 UNKNOWN_SD = 'unknown'
 """Entry of the provenance for the uncertainty of imported values."""
@@ -327,6 +327,12 @@ def beyond_instruments(calibration: Calibration, sensor: str) -> str:
     if np.abs(bias).max() > LARGEST_BIAS[sensor]:
         return f'a bias must be within full scale ({significant(LARGEST_BIAS[sensor])} SI), it is {significant(np.abs(bias).max())}'
     return ''
+
+
+def true_calibration(model: SensorModel, values: np.ndarray, frame_id: str, *, simulated: dict[str, Any]) -> Calibration:
+    """Return the exact calibration of a simulated IMU; `simulated` describes the simulation in its provenance."""
+    return Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), frame_id,
+                       {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': simulated}, **BY_DEFINITION)
 
 
 def beyond_known(share: float, section: str) -> str:

@@ -21,6 +21,7 @@ from trajectory_msgs.msg import JointTrajectory
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
+from imu_calibration.document.calibration import true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.kinematics.motion_limits import limits_of
@@ -37,7 +38,6 @@ from imu_calibration.simulation.sensor_noise import CAUSES, GRADES, hidden_cause
 from imu_calibration.simulation.session import SimulationOptions, random_values
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 from imu_calibration.use_cases.resources import config_file
-from imu_calibration.use_cases.simulate import true_calibration
 from msg_adapters.joint_state import trajectory_from_message
 from msg_adapters.write import encode_imu, encode_joints, encode_temperature, rows
 

@@ -5,22 +5,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Unpack, cast
-
-import numpy as np
+from typing import Unpack, cast
 
 from imu_calibration.core import documents
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import report
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
-from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration import Calibration, true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.decision import BY_DEFINITION
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
-from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
@@ -115,12 +111,6 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
     samples = SampleBlock(*run_session(model, values, mover, profile=motion, options=options, seed=seed))
     truth = true_calibration(model, values, options.frame_id, simulated={'seed': seed, 'profile': profile})
     return Simulated(samples, mover, truth, motion.duration)
-
-
-def true_calibration(model: SensorModel, values: np.ndarray, frame_id: str, *, simulated: dict[str, Any]) -> Calibration:
-    """Return the exact calibration of a simulated IMU; `simulated` describes the simulation in its provenance."""
-    return Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), frame_id,
-                       {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': simulated}, **BY_DEFINITION)
 
 
 def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike | Calibration, table: Stand | None, *, seed: int = 0,
