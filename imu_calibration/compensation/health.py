@@ -334,7 +334,7 @@ class CalibrationHealth:
         measured_length, measured_rate = (float(np.linalg.norm(stop.others[part])) for part in (slice(3), slice(3, 6)))
         if unit := unit_of_rest(measured_length):
             return LiveState(UNIT, f'the measured specific force at rest is {measured_length:.4g}: the unit is {unit}, it must be m/s^2; '
-                                     'correct the driver', values)
+                                   'correct the driver', values)
         lines = []
         if rate_off[axis] > LIMIT:
             lines.append(f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about {"xyz"[axis]}, '
@@ -353,7 +353,7 @@ class CalibrationHealth:
             force_off > LIMIT and abs(length - self._gravity) > WORSE * abs(measured_length - self._gravity) + LIMIT * gravity_sd)
         if harms:
             return LiveState(HARMS, '; '.join(lines) + ': without the calibration it would be less; is it the right one? calibrate again',
-                               values)
+                             values)
         if bias_update is not None and force_off <= LIMIT:
             return LiveState(FOLLOWED, '; '.join(lines) + ': corrected as long as stops confirm it', values)
         return LiveState(MOVED, '; '.join(lines) + ': calibrate again, unless it turned slowly and steadily there', values)

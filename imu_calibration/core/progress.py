@@ -12,7 +12,7 @@ class LiveState:
     """State of one part of a live system, for the user."""
 
     word: str
-    """One of a few words of that part."""
+    """Its value, from an enumeration of that part."""
     message: str
     """One line: the state and the remedy or next step."""
     values: dict[str, Any] = field(default_factory=dict)

@@ -86,7 +86,7 @@ class Playback(threading.Thread):
         return '' if self._is_over else f'stopped after {self._n_published} messages'
 
     def run(self) -> None:
-        """Publish everything."""
+        """Publish all messages."""
         error: BaseException | None = None
         try:
             self._play()

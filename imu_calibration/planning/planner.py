@@ -403,7 +403,7 @@ def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
         **of_joints,
         'motions': [{'kind': str(motion.kind), 'text': motion.words, 'begins': round(begin, 3), 'ends': round(end, 3),
                      'seconds': round(motion.seconds, 3), **motion.details}
-                    for motion, begin, end in zip(plan.motions, begins, begins[1:], strict=False)],
+                    for motion, begin, end in zip(plan.motions, begins[:-1], begins[1:], strict=True)],
         'parameters': {name: {'sd': float(f'{plan.sd[k]:.6g}'), 'tolerance': float(f'{plan.tolerances[k]:.6g}'),
                               'met': name not in plan.missing} for k, name in enumerate(plan.model.param_names) if plan.wanted[k]},
         'missing': list(plan.missing),

@@ -20,7 +20,7 @@ STEADY_SECONDS = 0.75
 _MIN_QUIET_SAMPLES = 10
 _GRID = 0.01  # s: spans begin and end on this grid, or at every sample of a slow IMU
 _GROWTH = 2.0
-_GUARD = 0.05  # s kept out on both sides of a disturbance, whose first samples can hide in a quiet span
+_GUARD = 0.05  # s excluded on both sides of a disturbance: its first samples can be in a quiet span
 
 
 class QuietFloor:
@@ -69,7 +69,7 @@ def quiet_beside_joints(force_s: np.ndarray, rate_s: np.ndarray, period: float, 
 
 
 def low_passed(values: np.ndarray, width: int) -> np.ndarray:
-    """Return the running mean over an odd number of samples, taken three times, shape (n, 3)."""
+    """Return the running mean over an odd number of samples, applied three times, shape (n, 3)."""
     for _ in range(3):
         values = uniform_filter1d(values, width, axis=0, mode='nearest')
     return values
@@ -205,7 +205,7 @@ def _covered(calm, width):
 
 
 def shrunk(mask: np.ndarray, margin: int) -> np.ndarray:
-    """Return `mask` without the cells within `margin` cells of a False one; beyond the ends nothing is False."""
+    """Return `mask` without the cells within `margin` cells of a False one; cells beyond the ends count as True."""
     return minimum_filter1d(mask, 2 * margin + 1, mode='constant', cval=1)
 
 

@@ -100,6 +100,7 @@ def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement,
     if target.whole:
         return Placement(), to_mapping(calibration)
     held = affine_of(calibration, target.holds)
+    # a target with diagonals only chooses its axes by the full matrices too
     placement = target.placement(affine_of(calibration, MATRICES + ARMS if np.any(held.arms) else MATRICES))
     return placement, target.numbers(moved(held, placement))
 
