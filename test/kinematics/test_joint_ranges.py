@@ -7,11 +7,11 @@ from refusal import refused
 
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
+from imu_calibration.kinematics.joint_motion import rest_at
 from imu_calibration.kinematics.motion_limits import limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import table_from_urdf
 from imu_calibration.planning.campaign import Campaign, CampaignSettings
-from imu_calibration.planning.path_watch import at_rest
 from imu_calibration.planning.planner import NextMotion, make_planner
 from imu_calibration.planning.situation import noise_of_grade
 from imu_calibration.simulation.sensor_noise import GRADES
@@ -84,7 +84,7 @@ def test_an_endless_joint_keeps_to_its_turns_and_is_unwound_at_the_end(start):
     for number in np.random.default_rng(1).permutation(len(planner.situation.motions))[:60]:
         points = planner.situation.motions[number].points(at)
         if len(points):
-            assert excess(trajectory_from(at_rest(at), points), limits)[0] <= 1e-9, planner.situation.motions[number].words
+            assert excess(trajectory_from(rest_at(at[None]), points), limits)[0] <= 1e-9, planner.situation.motions[number].words
             reached.append(points.position[:, 0])
             at = points.position[-1]
     assert np.ptp(np.concatenate(reached)) > 2 * np.pi and np.abs(np.concatenate(reached) - start).max() <= 2 * np.pi
