@@ -29,14 +29,14 @@ from imu_calibration.effects.sensor_model import (
 )
 from imu_calibration.estimation.solution import tolerances_of  # noqa: E402
 from imu_calibration.kinematics.motion_limits import limits_of  # noqa: E402
-from imu_calibration.planning.belief import exact_information  # noqa: E402
 from imu_calibration.planning.coordinates import Coordinates  # noqa: E402
+from imu_calibration.planning.motion_library import MotionLibrary  # noqa: E402
 from imu_calibration.planning.planner import Planner, make_planner  # noqa: E402
-from imu_calibration.planning.repertoire import Repertoire  # noqa: E402
-from imu_calibration.planning.situation import (
-    Situation,  # noqa: E402
+from imu_calibration.planning.planning_problem import (
+    PlanningProblem,  # noqa: E402
     noise_of_grade,  # noqa: E402
 )
+from imu_calibration.planning.posterior import exact_information  # noqa: E402
 from imu_calibration.references.options import CalibrationOptions, choose_model  # noqa: E402
 from imu_calibration.simulation.motion_builder import Profile  # noqa: E402
 from imu_calibration.simulation.profiles import make_profile  # noqa: E402
@@ -52,15 +52,15 @@ MARKS = np.linspace(0.1, 1.0, 19)
 """Shares of the fixed profile at which its result is evaluated."""
 
 
-def fixed_profile(situation, table):
+def fixed_profile(problem, table):
     """Return (times, standard deviations of all parameters at each) of the fixed profile."""
     profile = make_profile('calibration', 0, table)
-    windows = situation.predictor.predict([profile.segments])[0]
-    times, prior = np.array([window.middle for window in windows]), situation.coordinates.prior_information
+    windows = problem.predictor.predict([profile.segments])[0]
+    times, prior = np.array([window.middle for window in windows]), problem.coordinates.prior_information
     found = []
     for mark in MARKS:
         known = int(np.searchsorted(times, mark * profile.duration))
-        found.append(situation.coordinates.sd(np.linalg.inv(prior + exact_information(windows[:known], times[:known], situation.noise))))
+        found.append(problem.coordinates.sd(np.linalg.inv(prior + exact_information(windows[:known], times[:known], problem.noise))))
     return MARKS * profile.duration, np.array(found)
 
 
@@ -96,8 +96,8 @@ def one_table(number, seeds):
     rng = np.random.default_rng([number, 14])
     table, grade = random_table(rng, speeds_deg=(200, 400)), list(GRADES)[number % len(GRADES)]
     noise, model = noise_of_grade(GRADES[grade].noise, RATE), choose_model(CalibrationOptions(), table)
-    situation = Situation(Repertoire(table, limits_of(table)), Coordinates(model, tolerances_of(model)), noise)
-    times, sd = fixed_profile(situation, table)
+    problem = PlanningProblem(MotionLibrary(table, limits_of(table)), Coordinates(model, tolerances_of(model)), noise)
+    times, sd = fixed_profile(problem, table)
     tolerances = drawn_tolerances(rng, model, sd[-1])
     began = time.process_time()
     planner: Planner = make_planner(table, noise=noise, tolerances=tolerances)

@@ -38,7 +38,7 @@ QUANTISATION_P_VALUE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class FormFit:
+class ModelFit:
     """One form fitted to one axis."""
 
     form: tuple[str, ...]
@@ -53,20 +53,20 @@ class FormFit:
 class Choice:
     """The forms of one axis, the best first."""
 
-    fits: tuple[FormFit, ...]
+    fits: tuple[ModelFit, ...]
     """All forms in order of their cost."""
     moments: Moments
     """Data of the fit."""
 
     @property
-    def best(self) -> FormFit:
+    def best(self) -> ModelFit:
         """The selected form."""
         return self.fits[0]
 
     @property
-    def rivals(self) -> tuple[FormFit, ...]:
+    def rivals(self) -> tuple[ModelFit, ...]:
         """Other forms that explain the curve nearly as well, except supersets of a form named before."""
-        found: list[FormFit] = []
+        found: list[ModelFit] = []
         for fit in self.fits:
             if fit.cost - self.best.cost <= MAX_COST_EXCESS and not any(_is_part(known.form, fit.form) for known in (self.best, *found)):
                 found.append(fit)
@@ -83,9 +83,9 @@ class Choice:
         fast = tuple(known for known in self.best.fit.names if known == QUANTISATION.name)
         form = (name, *self.best.form)
         fit = fit_names(self.moments, (*fast, WHITE.name, *form))
-        return Choice((FormFit(form, fit, self.best.cost),), self.moments)
+        return Choice((ModelFit(form, fit, self.best.cost),), self.moments)
 
-    def close(self, name: str) -> FormFit | None:
+    def close(self, name: str) -> ModelFit | None:
         """Return the best form with a process among those that explain the curve nearly as well, or None."""
         near = [fit for fit in self.fits if name in fit.form and fit.cost - self.best.cost <= MAX_COST_EXCESS + PRICE_OF_TIME]
         return near[0] if near else None
@@ -111,12 +111,12 @@ def _all_forms(moments, fast, excess):
     return tuple(sorted(fits, key=lambda found: found.cost))
 
 
-def fit_form(moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), *, excess: float = 1.0) -> FormFit:
+def fit_form(moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), *, excess: float = 1.0) -> ModelFit:
     """Fit white noise, `fast` processes and the slow ones of a form; squares are divided by `excess`."""
     names = (*fast, WHITE.name, *form)
     fit = fit_names(moments, names)
     fit = _likeliest(moments, fit) if GAUSS_MARKOV in form else fit
-    return FormFit(tuple(form), fit, log_cost(moments, fit, excess) + PRICE * len(names) + PRICE_OF_TIME * (GAUSS_MARKOV in form))
+    return ModelFit(tuple(form), fit, log_cost(moments, fit, excess) + PRICE * len(names) + PRICE_OF_TIME * (GAUSS_MARKOV in form))
 
 
 def _likeliest(moments, fit):

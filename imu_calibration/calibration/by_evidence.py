@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from imu_calibration.calibration.from_solution import Demand, ModelChanges
+from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
 from imu_calibration.calibration.table_calibration import conclude, solve_recordings
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.distributions import chi2_sf
@@ -29,7 +29,7 @@ from imu_calibration.estimation.weighted_system import make_prior
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions, choose_model
-from imu_calibration.references.turntable.gathered import Gathered
+from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.parameter_space import ParameterSpace
@@ -39,7 +39,7 @@ from imu_calibration.selection.saturation import Saturation
 from imu_calibration.selection.search import FAMILY_WISE
 from imu_calibration.selection.unexplained import biases_off
 
-Solved = tuple[Solution, Gathered, SensorModel]
+Solved = tuple[Solution, SessionData, SensorModel]
 """A solution, the data that it was solved from, and the model of their columns."""
 
 
@@ -49,11 +49,11 @@ class EvidentSolution:
 
     solution: Solution
     """Solution of the requested model with the added effects, its covariance widened."""
-    gathered: Gathered
+    gathered: SessionData
     """The data that were solved."""
     model: SensorModel
     """The model of the gathered columns."""
-    demand: Demand = Demand()
+    extension: ModelExtension = ModelExtension()
     """Result of the search that later solutions of the same recordings need."""
     found: Investigation | None = None
     """Search result; None with too few windows."""
@@ -87,8 +87,8 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
     """
     solve = partial(solve_recordings, sources, table, mapper=mapper, names=names)
     found = solve_by_evidence(solve(options, keep_windows=not options.as_asked), table, options, solve_again=solve)
-    return EvidentResult(conclude(found.solution, found.gathered, found.model, table=table, options=found.demand.options(options),
-                                  provenance=provenance, changes=found.demand.changes), found.found)
+    return EvidentResult(conclude(found.solution, found.gathered, found.model, table=table, options=found.extension.options(options),
+                                  provenance=provenance, changes=found.extension.changes), found.found)
 
 
 def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, *,
@@ -99,7 +99,7 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
     Parameters
     ----------
     first : tuple
-        (Solution, Gathered with the windows of the search, SensorModel) of the requested model.
+        (Solution, SessionData with the windows of the search, SensorModel) of the requested model.
     table : Table
     options : CalibrationOptions
         Options of the requested model.
@@ -128,11 +128,11 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
             break
     else:
         added, point, (solution, gathered, model) = (), {}, first
-    demand = Demand(added, point, _changes([found, *others], added), _moves(found), _clipped(found))
-    return EvidentSolution(demand.applied(solution), gathered, model, demand, found)
+    extension = ModelExtension(added, point, _changes([found, *others], added), _moves(found), _clipped(found))
+    return EvidentSolution(extension.applied(solution), gathered, model, extension, found)
 
 
-def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known: Demand) -> EvidentSolution:
+def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known: ModelExtension) -> EvidentSolution:
     """
     Return the supported effects when columns cannot be recomputed: missing effects are reported and widen the covariance.
 
@@ -142,7 +142,7 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
         As for `solve_by_evidence`, of the requested model with the added effects.
     table, options
         As for `solve_by_evidence`.
-    known : Demand
+    known : ModelExtension
         The effects that were supported when the columns were computed.
 
     """
@@ -154,18 +154,18 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
     found = _without_faint(_examined(found), solution)
     lacking = [] if found.limits else _beyond(found.adopted, model)   # after a limit was found, the solution is that of the search
     changes = replace(_changes([found], known.added), lacking=tuple(question.name for question in lacking))
-    demand = Demand(known.added, known.point, changes, (*known.moves, *_moves(found, lacking)), _clipped(found))
-    return EvidentSolution(demand.applied(solution), gathered, model, demand, found)
+    extension = ModelExtension(known.added, known.point, changes, (*known.moves, *_moves(found, lacking)), _clipped(found))
+    return EvidentSolution(extension.applied(solution), gathered, model, extension, found)
 
 
-def windows_to_ask(gathered: Gathered) -> list[list[Window]]:
+def windows_to_ask(gathered: SessionData) -> list[list[Window]]:
     """Return the windows of each recording that suffice for a search of effects, the largest recording first."""
     return [windows for windows in (spread.windows for spread in gathered.spreads) if len(windows) >= MIN_FOLD_WINDOWS]
 
 
 def _clipped(found):
     """Return the solution of a search that found a limit, with only the saturated samples removed from its windows; else None."""
-    return extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.adopted,
+    return extended_solution(found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.adopted,
                              saturations=found.limits) if found.limits else None
 
 
@@ -177,10 +177,10 @@ def _examined(found):
 
 def _changes(searches, added):
     """Return the changes of the requested model by searches (the first has priority) and their effects."""
-    found, model = searches[0], searches[0].attempt.baseline
+    found, model = searches[0], searches[0].problem.baseline
     clipping = (model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name for limit in found.limits)
     rests = {sensor: rest.entry for each in reversed(searches) for sensor, rest in each.released().items() if rest.significant}
-    return ModelChanges((*clipping, *(name for _, name in added)), tuple(question.name for question in found.denied), _strange(searches),
+    return ModelChanges((*clipping, *(name for _, name in added)), tuple(question.name for question in found.unstable), _strange(searches),
                         unexplained=rests)
 
 
@@ -198,7 +198,7 @@ def _without_faint(found, solution):
     """Return the Investigation without findings that are in a solution but not significant."""
     faint = [question for question in found.named if _is_faint(solution, question)]
     return replace(found, named=[question for question in found.named if question not in faint],
-                   denied=[*found.denied, *faint]) if faint else found
+                   unstable=[*found.unstable, *faint]) if faint else found
 
 
 def _named_elsewhere(found, others):
@@ -258,15 +258,15 @@ def _strange(found):
 
 def _point(found):
     """Return effect -> values at which its columns are linearised, of the effects found."""
-    model = found.attempt.recording.model
+    model = found.problem.recording.model
     return {question.name: model.point[question.name] for question in found.adopted if question.name in model.point}
 
 
 def _moves(found, lacking=()):
     """Return (changes of parameters by other choices of effects, weight): rejected, doubtful, implausible or missing effects, rivals."""
-    moves = [(found.search.moved_by(found.named, question, found.attempt.space.names), 1.0)
-             for question in (*found.denied, *found.doubtful, *found.implausible, *lacking)]
-    moves += [(moved, 1.0) for moved in biases_off(found.attempt.baseline, found.rests)]
+    moves = [(found.search.moved_by(found.named, question, found.problem.space.names), 1.0)
+             for question in (*found.unstable, *found.rejected, *found.implausible, *lacking)]
+    moves += [(moved, 1.0) for moved in biases_off(found.problem.baseline, found.rests)]
     return (*moves, *((rival.moves, rival.weight) for rival in found.rivals))
 
 

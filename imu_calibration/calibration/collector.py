@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.samples import NominalScaling, SampleBlock
@@ -27,14 +27,14 @@ from imu_calibration.preprocessing.stream_cleaning import Watcher
 from imu_calibration.preprocessing.window import StoredWindows, Window, WindowSettings
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.references.turntable.gathered import (
+from imu_calibration.references.turntable.session_data import (
     KEPT_POSES,
     KEPT_SAMPLES,
     MAX_LIVE_SAMPLES,
-    Gathered,
+    DecimatedWindows,
     HeldOut,
     HeldOutBlock,
-    SpreadWindows,
+    SessionData,
     WindowStore,
     naming,
     owned_window,
@@ -45,23 +45,23 @@ _MODEL = ('accelerometer', 'gyroscope', 'reference')
 _PLAIN = ('counts', 'frame_id', 'first_stamp_ns', 'last_stamp_ns', 'largest_rate', 'largest_force', 'temperature_c')
 
 
-def to_bytes(gathered: Gathered, model: SensorModel, demand: Demand = Demand()) -> bytes:
+def to_bytes(gathered: SessionData, model: SensorModel, extension: ModelExtension = ModelExtension()) -> bytes:
     """
-    Return a `Gathered` as an npz archive: numbers to the last bit, no pickled objects.
+    Return a `SessionData` as an npz archive: numbers to the last bit, no pickled objects.
 
     Parameters
     ----------
-    gathered : Gathered
+    gathered : SessionData
         Its least-squares system, the held-out blocks of the proof, poses and counts; windows with samples are not saved.
     model : SensorModel
         The model of its columns.
-    demand : Demand
+    extension : ModelExtension
         Effects added to the requested model.
 
     """
     names = {name: list(getattr(model, name)) for name in (*_MODEL, 'joint_names')}
     header = {'format': SAVED_FORMAT, 'model': names | {'joint_errors': model.joint_names.errors},
-              'effects': model.definitions, 'demand': demand.to_mapping(),
+              'effects': model.definitions, 'demand': extension.to_mapping(),
               'temperature_ref_c': model.temperature_ref_c,
               'point': {name: np.asarray(value, float).tolist() for name, value in model.point.items()},
               **_header_of(gathered.accumulator), 'judged_from': gathered.judged_from,
@@ -102,9 +102,9 @@ def _arrays_of(accumulator, label):
     return arrays
 
 
-def from_bytes(data: bytes, model: SensorModel) -> Gathered:
+def from_bytes(data: bytes, model: SensorModel) -> SessionData:
     """
-    Return the `Gathered` in an archive.
+    Return the `SessionData` in an archive.
 
     Raises
     ------
@@ -140,10 +140,10 @@ def saved_model(data: bytes) -> SensorModel:
         return _model(header)
 
 
-def saved_demand(data: bytes) -> Demand:
+def saved_extension(data: bytes) -> ModelExtension:
     """Return the effects added to the requested model before a session was saved; raises as `from_bytes` when it is damaged."""
     with _reading(data) as (header, _):
-        return Demand.from_mapping(header.get('demand', {}), header['point'])
+        return ModelExtension.from_mapping(header.get('demand', {}), header['point'])
 
 
 def _model(header):
@@ -174,7 +174,8 @@ def _gathered(header, arrays):
         pieces = {tuple(key): arrays[f'held_out{number}.pieces.{k}'] for k, key in enumerate(known['pieces'])}
         accumulator = replace(held_out.blocks[number].accumulator, **_fields(known, arrays, f'held_out{number}.'))
         held_out.blocks[number] = HeldOutBlock(accumulator, pieces, known['counts'], known['judged'])
-    return Gathered(Accumulator(**_fields(header, arrays, '')), held_out, poses=poses, judged_from=header.get('judged_from', 0.0), **plain)
+    return SessionData(Accumulator(**_fields(header, arrays, '')), held_out, poses=poses,
+                       judged_from=header.get('judged_from', 0.0), **plain)
 
 
 def _fields(header, arrays, label):
@@ -213,7 +214,7 @@ class Collector:
                  windows: list | StoredWindows | None = None, spread: bool = False, judged_from: float = 0.0):
         self.table, self.model, self.session, self.windows, self.spread = table, model, session, windows, spread
         self.gatherer = MotionGatherer(table, settings, windows is not None, nominal=nominal, watchers=watchers)
-        self.gathered = Gathered(judged_from=judged_from)
+        self.gathered = SessionData(judged_from=judged_from)
 
     def push(self, block: SampleBlock) -> list[Window]:
         """Process a block and return the windows that it completed."""
@@ -223,7 +224,7 @@ class Collector:
             self._note_temperature(block.temperature.temperature_c)
         return self._take(self.gatherer.push(block))
 
-    def finish(self) -> Gathered:
+    def finish(self) -> SessionData:
         """Close the last window and return the gathered data."""
         self._take(self.gatherer.finish())
         self.update_counts()
@@ -298,15 +299,15 @@ class GatherStep:
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
 
-    def __call__(self, numbered: tuple[int, Callable]) -> Gathered:
-        """Return the Gathered of a recording, given (its number, callable that yields its blocks)."""
+    def __call__(self, numbered: tuple[int, Callable]) -> SessionData:
+        """Return the SessionData of a recording, given (its number, callable that yields its blocks)."""
         session, source = numbered
         return naming(self.names, session)(self.read, source(), session, Preflight(self.table.gravity_value))
 
     def read(self, blocks: Iterable[SampleBlock], session: int, preflight: Preflight, *,
-             windows: list | StoredWindows | None = None) -> Gathered:
+             windows: list | StoredWindows | None = None) -> SessionData:
         """
-        Return the Gathered of a recording, which is read once, for its windows and for the checks.
+        Return the SessionData of a recording, which is read once, for its windows and for the checks.
 
         All windows, unused ones too, are appended to `windows`.
 
@@ -325,31 +326,31 @@ class GatherStep:
         return gathered
 
 
-def columns_at(window: Window, model: SensorModel, *, table: Table, told: slice) -> dict[str, np.ndarray]:
-    """Return sensor -> columns at the samples `told` of a window."""
+def columns_at(window: Window, model: SensorModel, *, table: Table, reported: slice) -> dict[str, np.ndarray]:
+    """Return sensor -> columns at the samples `reported` of a window."""
     motion, temperature = joined_motion([window])
     if window.kind != 'static':
-        motion, temperature = motion.select(told), None if temperature is None else temperature[told]
+        motion, temperature = motion.select(reported), None if temperature is None else temperature[reported]
     return {sensor: columns(model, sensor, table, motion=motion, temperature_c=temperature) for sensor in SENSORS}
 
 
 class LiveCollector(Collector):
-    """A Collector that hands completed windows on, with their columns at the samples `told`, and keeps a bounded number of them."""
+    """A Collector that hands completed windows on, with their columns at the samples `reported`, and keeps a bounded number of them."""
 
     def __init__(self, table: Table, model: SensorModel, options: CalibrationOptions, *, session: int, store: WindowStore,
-                 told: Callable[[Window], slice]):
+                 reported: Callable[[Window], slice]):
         super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
-        self.store, self._told, self._completed = store, told, {}
-        self.gathered.spreads = [SpreadWindows(MAX_LIVE_SAMPLES)]
+        self.store, self._reported, self._completed = store, reported, {}
+        self.gathered.spreads = [DecimatedWindows(MAX_LIVE_SAMPLES)]
 
     def _columns(self, window):
-        told, designs = self._told(window), {}
+        reported, designs = self._reported(window), {}
 
         def kept(model, sensor, *arguments, **options):
             found = columns(model, sensor, *arguments, **options)
-            designs[sensor] = found if window.kind == 'static' else found[told].copy()
+            designs[sensor] = found if window.kind == 'static' else found[reported].copy()
             return found
-        self._completed[window] = told, designs
+        self._completed[window] = reported, designs
         return kept
 
     def _store(self, window, reduced):
@@ -366,7 +367,7 @@ class LiveCollector(Collector):
         completed, self._completed = self._completed, {}
         return completed
 
-    def snapshot(self, pending: bool) -> tuple[Gathered, WindowStore]:
+    def snapshot(self, pending: bool) -> tuple[SessionData, WindowStore]:
         """Return copies of the gathered data and of the store; with `pending`, open windows are closed in the copies."""
         twin = copy.copy(self)
         twin.gathered, twin.store, twin._completed = copied(self.gathered), self.store.copy(), {}
@@ -378,7 +379,7 @@ class LiveCollector(Collector):
         return twin.gathered, twin.store
 
 
-def copied(gathered: Gathered) -> Gathered:
+def copied(gathered: SessionData) -> SessionData:
     """Return a copy that shares only objects that are never changed in place."""
     return replace(gathered, accumulator=gathered.accumulator.copy(), held_out=gathered.held_out.copy(), poses=list(gathered.poses),
                    kept=[], counts=dict(gathered.counts), spreads=[spread.copy() for spread in gathered.spreads])

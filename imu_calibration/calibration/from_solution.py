@@ -25,7 +25,7 @@ from imu_calibration.preprocessing.checks import unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.window_cutter import dropped
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.references.turntable.gathered import Gathered
+from imu_calibration.references.turntable.session_data import SessionData
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class ModelChanges:
 
     added: tuple[str, ...] = ()
     """Added to the model because the data support them."""
-    denied: tuple[str, ...] = ()
+    unstable: tuple[str, ...] = ()
     """Not added because the estimates of parts of the recording differ; the standard deviations allow for them."""
     implausible: dict[str, float] = field(default_factory=dict)
     """
@@ -48,7 +48,7 @@ class ModelChanges:
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""
-        changes = (('added', list(self.added)), ('denied', list(self.denied)), ('implausible', self.implausible),
+        changes = (('added', list(self.added)), ('denied', list(self.unstable)), ('implausible', self.implausible),
                    ('lacking', list(self.lacking)), ('unexplained', self.unexplained))
         return {name: value for name, value in changes if value}
 
@@ -60,7 +60,7 @@ class ModelChanges:
 
 
 @dataclass(frozen=True, eq=False)
-class Demand:
+class ModelExtension:
     """Effects that a recording supports: the result of a search as needed for further solutions of the same and more windows."""
 
     added: tuple[tuple[str, str], ...] = ()
@@ -102,8 +102,8 @@ class Demand:
                 'moves': [[dict(moved), weight] for moved, weight in self.moves]}
 
     @classmethod
-    def from_mapping(cls, known: Mapping[str, Any], point: Mapping[str, Any]) -> 'Demand':
-        """Return the Demand from the mapping of `to_mapping`, with the separately saved point of the columns."""
+    def from_mapping(cls, known: Mapping[str, Any], point: Mapping[str, Any]) -> 'ModelExtension':
+        """Return the ModelExtension from the mapping of `to_mapping`, with the separately saved point of the columns."""
         added = tuple((str(sensor), str(name)) for sensor, name in known.get('added', ()))
         return cls(added, {name: np.asarray(point[name], float) for _, name in added if name in point},
                    ModelChanges.from_mapping(known.get('changes', {})),
@@ -123,7 +123,8 @@ def possible_motions(table: Table) -> tuple[Motion, ...] | None:
     return motions_about(*(table.mat_sl @ np.asarray(direction) for direction in (table.joints[0].axis, table.up)))
 
 
-def document(solution: Solution, tolerances: np.ndarray, gathered: Gathered, *, gravity: float, gauge: dict, undetermined: tuple[dict, ...],
+def document(solution: Solution, tolerances: np.ndarray, gathered: SessionData, *, gravity: float, gauge: dict,
+             undetermined: tuple[dict, ...],
              statistics: dict, provenance: dict | None, proof: dict | None, changes: ModelChanges, uncorrected: Uncorrected,
              tested: Collection[str] = ()) -> Calibration:
     """
@@ -133,7 +134,7 @@ def document(solution: Solution, tolerances: np.ndarray, gathered: Gathered, *, 
     ----------
     solution : Solution
     tolerances : ndarray, shape (n_params,)
-    gathered : Gathered
+    gathered : SessionData
         Data of the recording.
     gravity : float
         Of the reference, m/s^2.
@@ -183,9 +184,9 @@ def _need(weights, needed):
 
 def _besides(directions, needed, in_tolerances):
     """Return (sds in tolerances, motion) of the parameters that none of the worst directions names."""
-    told, others = set().union(*directions), {}
+    named, others = set().union(*directions), {}
     for name, (text, _) in needed.items():
-        if name not in told:
+        if name not in named:
             others.setdefault(text, {})[name] = round(float(in_tolerances[name]), 3)
     return [(names, text) for text, names in others.items()]
 
@@ -198,7 +199,7 @@ def with_gravity_uncertainty(solution: Solution, table: Table) -> Solution:
     return replace(solution, terms=with_term(solution.terms, GRAVITY, np.outer(direction, direction)))
 
 
-def statistics(solution: Solution, gathered: Gathered) -> dict:
+def statistics(solution: Solution, gathered: SessionData) -> dict:
     """Return the statistics section: noise, residuals, chi-square, windows, dropped samples."""
     result = {}
     for sensor in SENSORS:
@@ -227,7 +228,7 @@ def preflight_statistics(findings: Sequence[CheckFinding]) -> dict:
     return {'preflight': [finding.to_mapping() for finding in warnings(findings)], 'unusable': unusable(findings)}
 
 
-def conditions(gathered: Gathered, gravity: float) -> dict:
+def conditions(gathered: SessionData, gravity: float) -> dict:
     """Return the conditions section."""
     date = datetime.fromtimestamp((gathered.first_stamp_ns or 0) // 10**9, timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
     return {'temperature_range_c': gathered.temperature_c, 'largest_rate': gathered.largest_rate, 'largest_force': gathered.largest_force,

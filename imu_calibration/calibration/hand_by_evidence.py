@@ -51,10 +51,10 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
         return EvidentHand(solve_by_hand(data, options))
     found, asked = investigate_by_hand(data, options), _asked(data, options)
     while faint := _faint(hand := _solved(data, found, options), found, asked):
-        found = replace(found, named=[q for q in found.named if q not in faint], denied=[*found.denied, *faint])
+        found = replace(found, named=[q for q in found.named if q not in faint], unstable=[*found.unstable, *faint])
     added = tuple(q.name for q in found.adopted if q.name not in asked[q.sensor])
-    changes = ModelChanges(added, tuple(question.name for question in found.denied),
-                           {question.name: found.inquiry.explained.share(found.named, question) for question in found.implausible},
+    changes = ModelChanges(added, tuple(question.name for question in found.unstable),
+                           {question.name: found.problem.explained.share(found.named, question) for question in found.implausible},
                            unexplained={sensor: rest.entry for sensor, rest in found.unexplained.items() if rest.significant})
     return EvidentHand(hand, found, changes)
 
@@ -63,7 +63,7 @@ def _solved(data, found, options):
     """Return the calibration with the requested model and the findings; if the model is unchanged, the one of the search."""
     asked, names, base = _asked(data, options), found.names, found.baseline.model
     same = all(getattr(base, sensor) == _joined(asked[sensor], names[sensor]) for sensor in SENSORS)
-    return found.baseline if same and not (found.denied or found.implausible) else extended_by_hand(data, found, options)
+    return found.baseline if same and not (found.unstable or found.implausible) else extended_by_hand(data, found, options)
 
 
 def _faint(hand, found, asked):
@@ -82,9 +82,9 @@ def extended_by_hand(data: HandData, found: 'HandInvestigation', options: HandOp
     """Return the calibration with the requested model and the findings; denied or implausible effects increase its covariance."""
     asked, names = _asked(data, options), found.names
     extended = replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS})
-    hand = solve_by_hand(data, extended, found.point(found.inquiry, found.named))
+    hand = solve_by_hand(data, extended, found.point(found.problem, found.named))
     terms = hand.terms
-    for question in (*found.denied, *found.implausible):
+    for question in (*found.unstable, *found.implausible):
         moved = found.search.moved_by(found.named, question, found.baseline.param_names)
         shift = np.array([moved.get(name, 0.0) for name in hand.param_names])
         terms = with_term(terms, REJECTED, np.outer(shift, shift))

@@ -38,7 +38,7 @@ from imu_calibration.references.gravity.hand_calibration import GAUGE, HandCalib
 from imu_calibration.references.gravity.hand_options import hand_options
 from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.references.turntable.gathered import Gathered
+from imu_calibration.references.turntable.session_data import SessionData
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -114,10 +114,11 @@ class HandRecording:
     """Reason -> number of unusable samples."""
 
     @property
-    def gathered(self) -> Gathered:
+    def gathered(self) -> SessionData:
         """Data of the recording for the document, without parameters."""
         imu, warm = self.imu, self.temperature_c
-        return Gathered(counts=self.counts, frame_id=imu.frame_id, first_stamp_ns=int(imu.stamp_ns[0]), last_stamp_ns=int(imu.stamp_ns[-1]),
+        return SessionData(counts=self.counts, frame_id=imu.frame_id,
+                           first_stamp_ns=int(imu.stamp_ns[0]), last_stamp_ns=int(imu.stamp_ns[-1]),
                         largest_rate=float(np.sqrt(np.einsum('ij,ij->i', imu.rate_s, imu.rate_s).max())),
                         largest_force=float(max(imu.force_s.max(), -imu.force_s.min())),
                         temperature_c=None if warm is None else (float(warm.min()), float(warm.max())))

@@ -8,7 +8,7 @@ import numpy as np
 from imu_calibration.calibration import collector
 from imu_calibration.calibration.collector import LiveCollector, columns_at, copied
 from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, GroupState, group_states, table_coverage, waiting_groups
-from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, LiveSnapshot
 from imu_calibration.calibration.table_calibration import conclude
 from imu_calibration.calibration.table_result import TableResult
@@ -23,7 +23,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.stamping import StampLine
 from imu_calibration.preprocessing.window import Window, WindowSettings
 from imu_calibration.references.options import CalibrationOptions, choose_model
-from imu_calibration.references.turntable.gathered import Gathered, WindowStore, merge
+from imu_calibration.references.turntable.session_data import SessionData, WindowStore, merge
 from imu_calibration.selection.questions import linearise_again
 
 HELD_BACK = 200
@@ -58,10 +58,10 @@ class LiveCalibration:
     def __init__(self, table: Table, options: CalibrationOptions = CalibrationOptions(), settings: LiveSettings = LiveSettings(), *,
                  saved: bytes | None = None):
         self.table, self.options, self.settings = table, options, settings
-        self.earlier: Gathered | None = None
-        self.demand = Demand() if saved is None or options.as_asked else collector.saved_demand(saved)
+        self.earlier: SessionData | None = None
+        self.extension = ModelExtension() if saved is None or options.as_asked else collector.saved_extension(saved)
         """Effects added to the requested model."""
-        self._asked = choose_model(self.demand.options(options), table)
+        self._asked = choose_model(self.extension.options(options), table)
         self._waiting: list[SampleBlock] = []
         self._collector: LiveCollector | None = None
         self._first_temperature_c: float | None = None
@@ -166,7 +166,7 @@ class LiveCalibration:
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
         store = WindowStore(self.settings.store_samples, self.earlier is None)
-        self._collector = LiveCollector(self.table, model, self.options, session=session, store=store, told=self._told)
+        self._collector = LiveCollector(self.table, model, self.options, session=session, store=store, reported=self._reported)
 
     def solve(self, pending: bool = False, provenance: dict | None = None) -> TableResult:
         """
@@ -190,46 +190,46 @@ class LiveCalibration:
         """
         collector = self._begun()
         gathered, store = collector.snapshot(pending)
-        snapshot = LiveSnapshot(self._with_earlier(gathered), collector.model, self.table, self.options, self.demand, store,
+        snapshot = LiveSnapshot(self._with_earlier(gathered), collector.model, self.table, self.options, self.extension, store,
                                 collector.session, self._first_temperature_c)
-        options = self.demand.options(self.options)
+        options = self.extension.options(self.options)
         solution, total, model = snapshot.solved(options)
-        self.result = conclude(self.demand.applied(solution), total, model, table=self.table, options=options, provenance=provenance,
-                               changes=self.demand.changes)
+        self.result = conclude(self.extension.applied(solution), total, model, table=self.table, options=options, provenance=provenance,
+                               changes=self.extension.changes)
         self.last, self._too_far = snapshot, linearise_again(model, solution) is not None
         return self.result
 
-    def adopt(self, demand: Demand) -> bool:
+    def adopt(self, extension: ModelExtension) -> bool:
         """
         Add the effects that windows of this session support to the model of all further solutions; return whether the model changes.
 
         No change with the option `as_asked`, or when windows that need other columns are no longer kept.
         """
         collector = self._collector
-        if collector is None or self.last is None or self.options.as_asked or demand.is_nothing and self.demand.is_nothing:
+        if collector is None or self.last is None or self.options.as_asked or extension.is_nothing and self.extension.is_nothing:
             return False
-        model = self.last.model_for(demand.options(self.options))
+        model = self.last.model_for(extension.options(self.options))
         if not model.has_columns_of(collector.model):
             if not collector.store.complete:
                 return False
             collector.take_model(model)
             self._designs = {}
-        self.demand = demand
+        self.extension = extension
         return True
 
     def needs_linearising(self) -> bool:
         """Return whether the last solution is outside the validity of its linearisation, and the store is too small to linearise again."""
         return self._too_far
 
-    def gathered(self, pending: bool = False) -> Gathered:
+    def gathered(self, pending: bool = False) -> SessionData:
         """Return all gathered data, an earlier run included, to be saved."""
         if self._collector is None:
-            return self.earlier or Gathered()
+            return self.earlier or SessionData()
         return self._with_earlier(self._collector.snapshot(pending)[0])
 
     def saved(self, pending: bool = False) -> bytes:
         """Return all gathered data as bytes, for another run (see `accumulator_state`)."""
-        return collector.to_bytes(self.gathered(pending), self._begun().model, self.demand)
+        return collector.to_bytes(self.gathered(pending), self._begun().model, self.extension)
 
     def _begun(self) -> LiveCollector:
         if self._collector is None:
@@ -253,21 +253,21 @@ class LiveCalibration:
         parts = [self._residual(window) for window in windows]
         return ImuSamples.concatenate(parts)
 
-    def _told(self, window):
+    def _reported(self, window):
         """Return the samples of a window with published residuals."""
         every = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
         return slice(every // 2 if len(window) > every // 2 else 0, None, every)
 
     def _residual(self, window):
         model, values, gathered_with = self.result.model, self.result.solution.values, self._collector.model
-        told, designs = self._designs.get(window, (None, None))
+        reported, designs = self._designs.get(window, (None, None))
         if designs is None or self.result.gathered_model is not gathered_with:   # the solution was linearised elsewhere
-            told, gathered_with = self._told(window), model
-            designs = columns_at(window, model, table=self.table, told=told)
+            reported, gathered_with = self._reported(window), model
+            designs = columns_at(window, model, table=self.table, reported=reported)
         chosen = selected_columns(gathered_with, model)
-        parts = [measured[told] - designs[sensor][:, chosen[sensor][:-3]] @ coefficients(model, sensor, values)
+        parts = [measured[reported] - designs[sensor][:, chosen[sensor][:-3]] @ coefficients(model, sensor, values)
                  for sensor, measured in zip(SENSORS, (window.force_s, window.rate_s))]
-        return ImuSamples(window.stamp_ns[told], *parts, self._collector.gathered.frame_id)
+        return ImuSamples(window.stamp_ns[reported], *parts, self._collector.gathered.frame_id)
 
     def coverage(self) -> Coverage:
         """Return the Coverage: which attitudes are worth having, which motion helps most."""

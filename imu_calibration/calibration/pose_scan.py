@@ -31,7 +31,7 @@ FACE_REACH = np.pi / 4
 
 
 @dataclass(frozen=True, eq=False)
-class Findings:
+class PoseScan:
     """Result of the search for rest in the samples so far."""
 
     rests: list
@@ -48,11 +48,11 @@ class Findings:
     """Duration of the current rest, s; 0 in motion."""
 
 
-NO_FINDINGS = Findings([], None, 0, 0, {}, 0.0)
+NO_FINDINGS = PoseScan([], None, 0, 0, {}, 0.0)
 
 
-def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> Findings:
-    """Return the Findings in ImuSamples with rising stamps."""
+def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> PoseScan:
+    """Return the PoseScan in ImuSamples with rising stamps."""
     rests = [rest for rest in find_still(imu, windows) if rest.stop - rest.start >= 2]
     if not rests:
         return NO_FINDINGS
@@ -61,17 +61,17 @@ def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> Findings:
     turns, dropped = collect_turns(seconds, imu, poses=poses)
     goes_on = seconds[-1] - seconds[rests[-1].stop - 1] <= 0.1
     resting = float(seconds[-1] - seconds[rests[-1].start]) if goes_on else 0.0
-    return Findings(rests, poses, distinct_attitudes(poses.force), len(turns), dropped, resting)
+    return PoseScan(rests, poses, distinct_attitudes(poses.force), len(turns), dropped, resting)
 
 
-def hand_status(found: Findings, calibration: Calibration | None, *, step: str,
+def hand_status(found: PoseScan, calibration: Calibration | None, *, step: str,
                 hints: dict[str, str] | None = None) -> LiveState:
     """
     Return the LiveState.
 
     Parameters
     ----------
-    found : Findings
+    found : PoseScan
     calibration : Calibration or None
         The last solution.
     step : str
@@ -94,7 +94,7 @@ def hand_status(found: Findings, calibration: Calibration | None, *, step: str,
     return LiveState(word, '; '.join(parts), values)
 
 
-def unseen(found: Findings) -> list[str]:
+def unseen(found: PoseScan) -> list[str]:
     """Return the faces ('+x', ...) that have not been up, the one furthest from all attitudes first."""
     if found.poses is None:
         return list(FACE_DIRECTIONS)
@@ -119,7 +119,7 @@ def _plural(count, noun):
     return f'{count} {noun}' + ('' if count == 1 else 's')
 
 
-def knowledge_of(found: Findings, result: HandResult | None, options: HandOptions) -> HandKnowledge:
+def knowledge_of(found: PoseScan, result: HandResult | None, options: HandOptions) -> HandKnowledge:
     """Return the HandKnowledge of a session: before the first solution from its poses, then from the solution."""
     if result is not None:
         return knowledge_after(result.hand)
@@ -127,7 +127,7 @@ def knowledge_of(found: Findings, result: HandResult | None, options: HandOption
     return knowledge_at_first(model, tolerances_of(model.model, options.tolerances), poses=found.poses)
 
 
-def hand_coverage(found: Findings, result: HandResult | None, options: HandOptions, *, frame_id: str = '') -> Coverage:
+def hand_coverage(found: PoseScan, result: HandResult | None, options: HandOptions, *, frame_id: str = '') -> Coverage:
     """Return the Coverage of a session by hand: the cells, the next pose with the turn to it, and the remaining seconds."""
     seen = ups_of(found.poses)
     up = None if found.poses is None else seen[-1]

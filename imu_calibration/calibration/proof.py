@@ -19,7 +19,7 @@ from imu_calibration.estimation.accumulator import one_attitude
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.window_statistics import N_AXES, PIECE_TIME, Regime
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.gathered import HeldOut
+from imu_calibration.references.turntable.session_data import HeldOut
 
 BLOCK_RESAMPLES = 1000
 """Resamples of complete blocks for an interval."""

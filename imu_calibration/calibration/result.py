@@ -12,7 +12,7 @@ from imu_calibration.document.trust import usage
 from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.references.turntable.gathered import Gathered
+from imu_calibration.references.turntable.session_data import SessionData
 
 GRAVITY_SD = 5e-4
 """Standard deviation of the local gravity where a table description or the options give it without one, m/s^2."""
@@ -61,7 +61,7 @@ class CalibrationResult(ABC):
 
     calibration: Calibration
     """The document's content."""
-    gathered: Gathered
+    gathered: SessionData
     """Windows, counts, kept samples."""
     tolerances: np.ndarray
     """Tolerance of each parameter."""
@@ -118,8 +118,8 @@ def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> t
 
     `hints` as for `errors.with_hint`.
     """
-    lines, told = result.verdict.lines(hints), usage(result.calibration)
-    return str(result.verdict.word), [*lines, *[told] * bool(told)]
+    lines, hint = result.verdict.lines(hints), usage(result.calibration)
+    return str(result.verdict.word), [*lines, *[hint] * bool(hint)]
 
 
 def exit_code(calibration: Calibration) -> int:

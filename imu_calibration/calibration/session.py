@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import EvidentSolution, Solved, ask_kept, solve_by_evidence
-from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.table_calibration import solve_gathered, solve_in_passes
 from imu_calibration.core.settings import setting
 from imu_calibration.effects.sensor_model import SensorModel
@@ -13,14 +13,14 @@ from imu_calibration.kinematics.rotations import local_gravity
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.joint_checks import check_units
 from imu_calibration.references.options import CalibrationOptions, choose_model
-from imu_calibration.references.turntable.gathered import Gathered, WindowStore
+from imu_calibration.references.turntable.session_data import SessionData, WindowStore
 
 
 @dataclass(frozen=True, eq=False)
 class LiveSnapshot:
     """Unchanging copies of the gathered data."""
 
-    gathered: Gathered
+    gathered: SessionData
     """An earlier run included, with the windows of the search."""
     model: SensorModel
     """The model of its columns."""
@@ -28,7 +28,7 @@ class LiveSnapshot:
     """The reference."""
     options: CalibrationOptions
     """Options of the requested model."""
-    demand: Demand
+    extension: ModelExtension
     """Effects added to the model."""
     store: WindowStore
     """The windows of this run, while they are all kept."""
@@ -44,7 +44,7 @@ class LiveSnapshot:
 
     def solved(self, options: CalibrationOptions) -> Solved:
         """
-        Return (Solution, Gathered, SensorModel of the columns) for other options, as from a recording.
+        Return (Solution, SessionData, SensorModel of the columns) for other options, as from a recording.
 
         If the windows are no longer kept, the gathered columns are used.
         """
@@ -63,7 +63,7 @@ class LiveSnapshot:
         """Return the solution with the supported effects, as `calibrate_by_evidence`."""
         if self.store.complete:
             return solve_by_evidence(self.solved(self.options), self.table, self.options, solve_again=self.solved)
-        return ask_kept(self.solved(self.demand.options(self.options)), self.table, self.options, known=self.demand)
+        return ask_kept(self.solved(self.extension.options(self.options)), self.table, self.options, known=self.extension)
 
 
 @dataclass(frozen=True)

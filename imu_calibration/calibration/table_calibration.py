@@ -39,7 +39,7 @@ from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_units
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
-from imu_calibration.references.turntable.gathered import Gathered, HeldOut, join, naming
+from imu_calibration.references.turntable.session_data import HeldOut, SessionData, join, naming
 from imu_calibration.selection.questions import MAX_TABLE_PASSES, at_time_constants, linearise_again
 
 
@@ -79,9 +79,9 @@ def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOpt
 
 def solve_recordings(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
                      mapper: Callable = map, names: Sequence[str] | None = None,
-                     keep_windows: bool = False) -> tuple[Solution, Gathered, SensorModel]:
+                     keep_windows: bool = False) -> tuple[Solution, SessionData, SensorModel]:
     """
-    Return (Solution, Gathered, SensorModel of the gathered columns) of recordings; arguments as in `calibrate`.
+    Return (Solution, SessionData, SensorModel of the gathered columns) of recordings; arguments as in `calibrate`.
 
     keep_windows : bool
         Whether windows are kept for the search of effects (`by_evidence`).
@@ -100,11 +100,11 @@ def solve_recordings(sources: Sequence[Callable], table: Table, options: Calibra
     return solve_in_passes(model, options, solved)
 
 
-def solve_in_passes(model: SensorModel, options: CalibrationOptions, solved: Callable) -> tuple[Solution, Gathered, SensorModel]:
+def solve_in_passes(model: SensorModel, options: CalibrationOptions, solved: Callable) -> tuple[Solution, SessionData, SensorModel]:
     """
-    Return (Solution, Gathered, SensorModel of the gathered columns) at the solution of a linearisation that is valid there.
+    Return (Solution, SessionData, SensorModel of the gathered columns) at the solution of a linearisation that is valid there.
 
-    ``solved(model, judged_from)`` returns (Solution, Gathered) with the columns of a model, and windows from that time on for the proof.
+    ``solved(model, judged_from)`` returns (Solution, SessionData) with the columns of a model, and windows from that time on for the proof.
     """
     again, judged_from = _at_time_constants(model, options, lambda trial: solved(trial, 0.0)), 0.0
     for _ in range(MAX_TABLE_PASSES):
@@ -139,7 +139,7 @@ def _first_temperature(sources):
     raise InputError('a thermal effect needs temperatures, the recording has none; record imu/temperature or omit the effect')
 
 
-def solve_gathered(gathered: Gathered, model: SensorModel, options: CalibrationOptions = CalibrationOptions()) -> Solution:
+def solve_gathered(gathered: SessionData, model: SensorModel, options: CalibrationOptions = CalibrationOptions()) -> Solution:
     """Return the Solution of gathered data with the columns of `model` for the requested effects: the reduce step."""
     narrow = settle_model(model, options, gathered)
     accumulator = gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
@@ -168,13 +168,13 @@ def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions 
                             f"this is of {', '.join(model.joint_names) or 'none'}; "
                             'give the table or the arm that it was gathered on', key='table')
     gathered = collector.from_bytes(data, model)
-    demand = collector.saved_demand(data)
-    options = demand.options(options)
-    return conclude(demand.applied(solve_gathered(gathered, model, options)), gathered, model, table=table, options=options,
-                    changes=demand.changes).calibration
+    extension = collector.saved_extension(data)
+    options = extension.options(options)
+    return conclude(extension.applied(solve_gathered(gathered, model, options)), gathered, model, table=table, options=options,
+                    changes=extension.changes).calibration
 
 
-def conclude(solution: Solution, gathered: Gathered, model: SensorModel, *, table: Table,
+def conclude(solution: Solution, gathered: SessionData, model: SensorModel, *, table: Table,
              options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None,
              changes: ModelChanges = ModelChanges()) -> TableResult:
     """Judge a solution of data gathered with `model`, name the missing motions, and return the TableResult."""
@@ -209,7 +209,7 @@ class CheckResult:
     proof: dict
     """Sensor -> error before and after, interval and amount of data, by regime (see `proof.prove`); {}: not determined."""
     findings: tuple = ()
-    """Findings of the checks of the recording."""
+    """PoseScan of the checks of the recording."""
     why: str = 'fewer than three windows of rest or motion were found; record for longer'
     """Why there is no proof, where there is none."""
     notes: tuple[str, ...] = ()

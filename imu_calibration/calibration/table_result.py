@@ -36,7 +36,7 @@ from imu_calibration.kinematics.chain import tilt
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.references.turntable.gathered import HeldOut, HeldOutBlock
+from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBlock
 
 LEVELLING_SD = 2 * ARCMIN
 """Levelling of the table in each of two directions, rad; counts when table_tilt is not estimated."""

@@ -111,7 +111,7 @@ def _judge(out, look, hints):
     if result is None or look.refused:
         return 0
     if isinstance(result, ImuCalibrationError):
-        out.print(f'not usable for calibration: {result.told(hints)}')
+        out.print(f'not usable for calibration: {result.with_hint(hints)}')
         return 3
     out.print()
     for kind, count in result.calibration.statistics['windows'].items():
@@ -123,7 +123,7 @@ def _judge(out, look, hints):
 def _show_by_hand(out, found, hints):
     """Print whether the recording can be calibrated by hand, and which parameters that determines."""
     if isinstance(found, ImuCalibrationError):
-        out.print(f'not usable for calibration without a table: {found.told(hints)}')
+        out.print(f'not usable for calibration without a table: {found.with_hint(hints)}')
         return
     windows = found.calibration.statistics['windows']
     out.print(f'by hand, without a table, it determines, from {windows["static"]} poses and {windows["turns"]} turns between them:')

@@ -127,7 +127,7 @@ def run(options: Namespace) -> int:
         return 1
     except (ImuCalibrationError, OSError, MemoryError, RecursionError) as error:
         if isinstance(error, ImuCalibrationError):
-            text, key, name = error.told(hints_of(options)), error.key, error.code
+            text, key, name = error.with_hint(hints_of(options)), error.key, error.code
         else:
             text, key, name = printable(f'{type(error).__name__}: {error}; check disk space, memory, permissions and the input'), None, ''
         complain(f'{prog}: {text}')

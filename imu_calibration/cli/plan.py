@@ -68,7 +68,7 @@ def _pose(text):
 
 
 def _stand(options):
-    from imu_calibration.planning.repertoire import yaw_table
+    from imu_calibration.planning.motion_library import yaw_table
     if options.motion == 'yaw-only':
         return yaw_table(options.gravity)
     stand = stand_of(options)

@@ -49,7 +49,7 @@ class ImuCalibrationError(Exception):
         """Return the error with the name of its subject before its text."""
         return type(self)(f'{name}: {self}', key=self.key, code=self.code)
 
-    def told(self, hints: dict[str, str]) -> str:
+    def with_hint(self, hints: dict[str, str]) -> str:
         """Return the text with the local name of the key; `hints` as for `with_hint`."""
         return with_hint(str(self), self.key, hints)
 

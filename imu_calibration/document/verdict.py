@@ -69,13 +69,13 @@ def _unused_rests(calibration):
 
 def _adopted(calibration):
     """Return notes on the changes of the model by the recording."""
-    added, denied = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
+    added, unstable = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
     notes = [Reason(NOTE, 'added to the model, because the recording demands it: '
                     f'{", ".join(_with_size(calibration, name) for name in added)}',
                     'see the evidence; the requested model omits it', key='diagnose')] if added else []
     notes += [Reason(NOTE, f'not added to the model, because parts of the recording disagree, no coefficient is significant or the size is '
-                    f'implausible: {", ".join(denied)}; the standard deviations allow for it',
-                     'see the evidence', key='diagnose')] if denied else []
+                    f'implausible: {", ".join(unstable)}; the standard deviations allow for it',
+                     'see the evidence', key='diagnose')] if unstable else []
     lacking = calibration.statistics.get('lacking') or []
     notes += [Reason(NOTE, f'the motion demands {", ".join(lacking)}, which cannot join the model, since not all of it is kept: '
                      'the standard deviations allow for it', 'calibrate the recording offline')] if lacking else []
@@ -99,8 +99,8 @@ def unexplained_text(sensor: str, rms: float, unit: str | None = None) -> str:
 
 def _strange(values):
     """Return names with the values they would have had; of many, the first ones."""
-    told = ', '.join(f'{name} ({value:.3g})' for name, value in list(values.items())[:SHOWN_NAMES])
-    return told + (' ...' if len(values) > SHOWN_NAMES else '')
+    shown = ', '.join(f'{name} ({value:.3g})' for name, value in list(values.items())[:SHOWN_NAMES])
+    return shown + (' ...' if len(values) > SHOWN_NAMES else '')
 
 
 def _with_size(calibration, name):

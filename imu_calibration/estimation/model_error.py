@@ -86,13 +86,13 @@ def _scatter_of_means(noise):
     return noise.offset_sd**2 + sum(process.sd**2 for process in noise.bias_processes if process.time < NO_BIAS)
 
 
-def errors_of_waves(waves: 'Waves', model: SensorModel) -> tuple[ModelError, set[str]]:
+def errors_of_waves(waves: 'CosineScores', model: SensorModel) -> tuple[ModelError, set[str]]:
     """
     Return (ModelError, sensors with significant scatter) from the shifts between parts of a recording.
 
     Parameters
     ----------
-    waves : Waves
+    waves : CosineScores
     model : SensorModel
         Its parameters; a group are those of one effect.
 
@@ -178,10 +178,10 @@ def _waves_of_blocks(information, gradient, prior_root, free, shared=None):
         along = np.einsum('kc,cdi->kdi', weights, shared[:, :, free])
         expected -= along.transpose(0, 2, 1) @ along
     expected = covariance @ expected @ covariance
-    return Waves(np.flatnonzero(free), weights @ gradient @ covariance, expected, covariance=covariance)
+    return CosineScores(np.flatnonzero(free), weights @ gradient @ covariance, expected, covariance=covariance)
 
 
-class Waves:
+class CosineScores:
     """
     Shifts of the parameters along slow cosines over a recording, with their covariance under noise.
 

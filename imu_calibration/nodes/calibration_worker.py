@@ -125,7 +125,7 @@ class CalibrationWorker(threading.Thread):
         try:
             step()
         except ImuCalibrationError as error:
-            self._note_fault(name, error.told(self.hints))
+            self._note_fault(name, error.with_hint(self.hints))
         except Exception as error:
             self._note_fault(name, f'{name.replace("_", " ")} failed and is left out: {shortened(f"{type(error).__name__}: {error}", 200)}')
         else:
@@ -155,7 +155,7 @@ class CalibrationWorker(threading.Thread):
             try:
                 success, message = request.action()
             except ImuCalibrationError as error:
-                success, message = False, error.told(self.hints)
+                success, message = False, error.with_hint(self.hints)
             except Exception as error:   # every request gets a result
                 success, message = False, shortened(f'{type(error).__name__}: {error}', 300)
             self._survive(self._tell)   # the requester reads the diagnostics next
@@ -173,7 +173,7 @@ class CalibrationWorker(threading.Thread):
             if idle:
                 self._diagnosis.want()
         except ImuCalibrationError as error:
-            self._trouble = error.told(self.hints)
+            self._trouble = error.with_hint(self.hints)
             self._note_fault('solution', '' if isinstance(error, NotObservableError) else self._trouble)
 
     def _diagnose_when_due(self) -> None:
@@ -188,8 +188,8 @@ class CalibrationWorker(threading.Thread):
 
     def _adopt(self) -> bool:
         """Apply the last result of the diagnosis to the model; return whether the model changes."""
-        demand, session = self._diagnosis.take_demand(), self.live.on_table
-        return demand is not None and session is not None and session.adopt(demand)
+        extension, session = self._diagnosis.take_extension(), self.live.on_table
+        return extension is not None and session is not None and session.adopt(extension)
 
     def _settled_solution(self) -> tuple[CalibrationResult, str]:
         """Publish the solution of all messages with the model that the diagnosis requires: the result of `calibrate` for these messages."""
@@ -231,7 +231,7 @@ class CalibrationWorker(threading.Thread):
             result, text = self._settled_solution()
             what = f'{result.verdict.text}: {missing(result.calibration) or "every parameter is determined"}'
         except ImuCalibrationError as error:
-            what = f'no calibration yet: {error.told(self.hints)}'
+            what = f'no calibration yet: {error.with_hint(self.hints)}'
         if text is None and not self.live.n_windows:
             return False, f'{what}; no file was written'
         whole, written = self.place.save(self.live, text)

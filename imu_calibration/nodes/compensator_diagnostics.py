@@ -106,11 +106,11 @@ class CompensatorDiagnostics:
     def _tell_stamps(self, compensation):
         """Log irregular stamps once, and again when their rate changes."""
         line = None if compensation is None else compensation.slope.line
-        if line is not None and (told := (line.word, round(np.log(line.period_ns) / ANOTHER_RATE))) != self._told_stamps:
-            if (line.word == COUNTED or self._told_stamps is not None) and monotonic() - self._stamps_at.get(told, -np.inf) >= REMINDER:
-                self._stamps_at[told] = monotonic()
+        if line is not None and (shown := (line.word, round(np.log(line.period_ns) / ANOTHER_RATE))) != self._told_stamps:
+            if (line.word == COUNTED or self._told_stamps is not None) and monotonic() - self._stamps_at.get(shown, -np.inf) >= REMINDER:
+                self._stamps_at[shown] = monotonic()
                 self._node.get_logger().info(str(line))
-            self._told_stamps = told
+            self._told_stamps = shown
 
     def _lines(self, compensation):
         """Return (faults that prevent correction, notes), one line each."""

@@ -213,7 +213,7 @@ class CompensatorNode(Node):
             self.diagnostics.publish_now()
             return f'waiting for {awaited}'
         except ImuCalibrationError as error:
-            why = error.told(HINTS['compensator_node'])
+            why = error.with_hint(HINTS['compensator_node'])
             self.refusal = error.code
         self.problem = f'the calibration from {source} was refused: {why}'
         self.diagnostics.publish_now()

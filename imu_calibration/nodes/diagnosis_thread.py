@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from imu_calibration.calibration.diagnosis.live_diagnosis import FAILED, NOT_YET, OFF, Answer, DiagnosisQuestion
-from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.session import SolvePacer
 from imu_calibration.core.progress import LiveState, listening
 from imu_calibration.selection.reduced_recording import REDUCING
@@ -87,7 +87,7 @@ class DiagnosisThread:
         self.state = NOT_YET if period else LiveState(OFF, OFF_WHY)
         self.n_answers, self._session = 0, 0
         self._answered: dict | None = None   # numbers of samples of the last question; the question itself keeps all windows in memory
-        self._demand: Demand | None = None
+        self._extension: ModelExtension | None = None
 
     def change(self, period: float) -> None:
         """Use another period; 0: no more diagnoses."""
@@ -107,7 +107,7 @@ class DiagnosisThread:
     def forget(self) -> None:
         """Discard all results: the session is restarted."""
         self.state, self._wanted, self._urgent = NOT_YET if self.period else self.state, False, False
-        self._answered = self._demand = None
+        self._answered = self._extension = None
         self._session += 1
 
     def ask_when_due(self, make_question: Callable[[], DiagnosisQuestion | None], is_news: bool) -> None:
@@ -132,17 +132,18 @@ class DiagnosisThread:
         except Exception as error:   # a diagnosis that fails must not end the calibration
             answer = Answer(LiveState(FAILED, f'the diagnosis failed: {type(error).__name__}: {error}'))
         if session == self._session:
-            self.state, self._demand, self._answered, self.n_answers = answer.state, answer.demand, question.samples, self.n_answers + 1
+            self.state, self._extension = answer.state, answer.extension
+            self._answered, self.n_answers = question.samples, self.n_answers + 1
         del answer
         return_freed_memory()
         end = time.monotonic()
         self._next = end + self.period
         self._pacer.note(start, end)
 
-    def take_demand(self) -> Demand | None:
+    def take_extension(self) -> ModelExtension | None:
         """Return the change of the model that the last diagnosis requires, once."""
-        demand, self._demand = self._demand, None
-        return demand
+        extension, self._extension = self._extension, None
+        return extension
 
     def settle(self, question: DiagnosisQuestion | None) -> None:
         """Run a diagnosis and wait for it; one of the same windows that was completed already is not repeated."""

@@ -45,7 +45,7 @@ class StreamFindings:
     source: str
     """Its publishers and how reliable they are."""
     findings: tuple[CheckFinding, ...]
-    """Findings of preflight."""
+    """PoseScan of preflight."""
 
 
 def look(node: Node, spin_once: Any) -> list[StreamFindings]:

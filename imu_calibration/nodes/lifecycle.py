@@ -89,8 +89,8 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
             rclpy.try_shutdown()
     for number in SIGNALS:
         signal.signal(number, asked)
-    told = sys.unraisablehook   # incomplete objects of rclpy at the end of the context are not reported either
-    sys.unraisablehook = lambda unraisable: None if asked_to_end else told(unraisable)
+    report = sys.unraisablehook   # incomplete objects of rclpy at the end of the context are not reported either
+    sys.unraisablehook = lambda unraisable: None if asked_to_end else report(unraisable)
     # A node with a final message needs the context until it is sent.
     rclpy.init(args=arguments, **({'signal_handler_options': SignalHandlerOptions.NO} if halts else {}))
     try:
@@ -105,7 +105,7 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
     except (ExternalShutdownException, KeyboardInterrupt):
         pass
     except ImuCalibrationError as error:
-        return _failed(error.told(hints or {}))
+        return _failed(error.with_hint(hints or {}))
     except Exception as error:
         # A context that ends while something is being made or published fails in many ways; none of them is news.
         time.sleep(HEARD)

@@ -116,7 +116,7 @@ def _set(groups: list[_Group], parameters: list) -> SetParametersResult:
                     group.take(settings)
                 group.settings = settings
     except ImuCalibrationError as error:
-        return SetParametersResult(successful=False, reason=error.told(hints))
+        return SetParametersResult(successful=False, reason=error.with_hint(hints))
     except Exception as error:   # the requester receives a response, and the node continues unchanged
         return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
     return SetParametersResult(successful=True)

@@ -46,9 +46,9 @@ from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.planning.campaign import Campaign, CampaignSettings, Suspect, separator_of
 from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
+from imu_calibration.planning.motion_library import up_at
 from imu_calibration.planning.planner import Planner, make_planner
-from imu_calibration.planning.repertoire import up_at
-from imu_calibration.planning.situation import expected_noise, require_grade
+from imu_calibration.planning.planning_problem import expected_noise, require_grade
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.use_cases.resources import config_file
@@ -290,8 +290,8 @@ class PlannerNode(Node):
         with self._heard:
             came = self._heard.wait_for(lambda: self._told.get('diagnoses', '0') != known and self._told.get('being made') == 'False',
                                         timeout=ANSWER_PATIENCE)
-            told = dict(self._told)
-        return findings_from(told) if came else None
+            values = dict(self._told)
+        return findings_from(values) if came else None
 
     # Requests of the user.
 
@@ -329,7 +329,7 @@ class PlannerNode(Node):
         try:
             response.success, response.message = answer()
         except ImuCalibrationError as error:
-            response.success, response.message = False, error.told(HINTS['planner_node'])
+            response.success, response.message = False, error.with_hint(HINTS['planner_node'])
         except Exception as error:
             response.success, response.message = False, self._failed(error)
         self._say(LOG_INFO if response.success else LOG_ERROR, f'~/{what}: {response.message}')

@@ -215,11 +215,11 @@ class PlannerWorker(threading.Thread):
         self._peers.say(LOG_INFO, f'motion {self.driver.motions}, {points.duration:.0f} s: {decision.motion.words}; {decision.why}')
 
 
-def findings_from(told: dict[str, str]) -> list[Suspect]:
+def findings_from(values: dict[str, str]) -> list[Suspect]:
     """Return the model errors in the values of calibration_node's status 'diagnosis', the strongest first."""
-    if told.get('outcome') != FOUND:
+    if values.get('outcome') != FOUND:
         return []
-    found = [(key.removeprefix(MATES_KEY), value.split()) for key, value in told.items() if key.startswith(MATES_KEY)]
+    found = [(key.removeprefix(MATES_KEY), value.split()) for key, value in values.items() if key.startswith(MATES_KEY)]
     return [Suspect(effect, tuple(mates), {key.removeprefix(f'{SIZE_KEY}{each}.'): float(value) for each in (effect, *mates)
-                                           for key, value in told.items() if key.startswith(f'{SIZE_KEY}{each}.')})
+                                           for key, value in values.items() if key.startswith(f'{SIZE_KEY}{each}.')})
             for effect, mates in found]

@@ -16,11 +16,11 @@ from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import HELD, tolerances_of
 from imu_calibration.kinematics.motion_limits import MotionLimits, limits_of
 from imu_calibration.kinematics.table import Table
-from imu_calibration.planning.belief import exact_information
 from imu_calibration.planning.coordinates import Cause, Coordinates, ToldApart
+from imu_calibration.planning.motion_library import MotionLibrary
 from imu_calibration.planning.planner import Planner
-from imu_calibration.planning.repertoire import Repertoire
-from imu_calibration.planning.situation import Situation
+from imu_calibration.planning.planning_problem import PlanningProblem
+from imu_calibration.planning.posterior import exact_information
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.selection.questions import special
 from imu_calibration.simulation.profiles import make_profile
@@ -72,14 +72,14 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
         _require_shown_by_motion(model, key)
     values = model.start_from(calibration.model, calibration.values)
     coordinates = Coordinates(model, tolerances_of(model, options.tolerances), values)
-    situation = Situation(Repertoire(table, limits or limits_of(table)), coordinates, dict(noise), rate=rate)
+    problem = PlanningProblem(MotionLibrary(table, limits or limits_of(table)), coordinates, dict(noise), rate=rate)
     questions = len(model.catalogue.effects(model.joint_names))
-    situation.goal = ToldApart(coordinates, suspected(situation, causes, table, sizes=sizes or {}), questions)
+    problem.goal = ToldApart(coordinates, suspected(problem, causes, table, sizes=sizes or {}), questions)
     names = {name: k for k, name in enumerate(calibration.param_names) if k not in _indices(calibration.model, first)}
-    return Planner(situation, coordinates.information_from(names, calibration.covariance))
+    return Planner(problem, coordinates.information_from(names, calibration.covariance))
 
 
-def suspected(situation: Situation, causes: Sequence[tuple[str, str]], table: Table, *,
+def suspected(problem: PlanningProblem, causes: Sequence[tuple[str, str]], table: Table, *,
               sizes: Mapping[str, float]) -> list[Cause]:
     """
     Return the causes with their sizes: the first as estimated, the mates with the size that imitates it.
@@ -87,22 +87,22 @@ def suspected(situation: Situation, causes: Sequence[tuple[str, str]], table: Ta
     If `sizes` lacks a mate, ``theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra] theta_a``, M the
     information of a usual session, r the baseline.
     """
-    coordinates = situation.coordinates
+    coordinates = problem.coordinates
     found = []
     for key in causes:
         places, names = _indices(coordinates.model, key), coordinates.model.param_names
         known = coordinates.values[places] if not found else [sizes.get(names[k], np.nan) for k in places]
         found.append(Cause(key, _places(coordinates, key), np.asarray(known, float) / coordinates.units[places]))
     unknown = [cause for cause in found if np.isnan(cause.size).any()]
-    passing = _imitating(situation, found, unknown, table) if unknown else {}
+    passing = _imitating(problem, found, unknown, table) if unknown else {}
     return [replace(cause, size=passing.get(cause.key, cause.size)) for cause in found]
 
 
-def _imitating(situation, causes, unknown, table):
+def _imitating(problem, causes, unknown, table):
     """Return the sizes that causes must have to pass for the first one on a usual session, by key."""
-    windows = situation.predictor.predict([make_profile(SESSION, 0, table).segments])[0]
+    windows = problem.predictor.predict([make_profile(SESSION, 0, table).segments])[0]
     times = np.array([window.middle for window in windows])
-    information = situation.coordinates.prior_information + exact_information(windows, times, situation.noise)
+    information = problem.coordinates.prior_information + exact_information(windows, times, problem.noise)
     first, found = causes[0], {}
     rest = np.setdiff1d(np.arange(len(information)), np.concatenate([cause.places for cause in causes]))
     inner = np.linalg.inv(information[np.ix_(rest, rest)])
@@ -197,7 +197,7 @@ class Campaign:
         self._first: Callable[[np.ndarray], Any] | None = first
         self._separator: Planner | None = None
         self.findings: list[Suspect] | None = None
-        """Findings of the last diagnosis, the strongest first; None before the first diagnosis."""
+        """PoseScan of the last diagnosis, the strongest first; None before the first diagnosis."""
         self.separations = 0
         self.told_apart: tuple[str, ...] = ()
         """The collinear class of the last separating motion."""

@@ -17,10 +17,10 @@ from imu_calibration.estimation.noise_model import NoiseModel, ReferenceNoise
 from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints, limits_of
 from imu_calibration.kinematics.table import Table
-from imu_calibration.planning.belief import Belief
 from imu_calibration.planning.coordinates import Coordinates, ToldApart, WithinTolerances
-from imu_calibration.planning.repertoire import MotionKind, PlannedMotion, Repertoire, trajectory
-from imu_calibration.planning.situation import PROBABILITY, Situation
+from imu_calibration.planning.motion_library import MotionKind, MotionLibrary, PlannedMotion, trajectory
+from imu_calibration.planning.planning_problem import PROBABILITY, PlanningProblem
+from imu_calibration.planning.posterior import Posterior
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
@@ -33,18 +33,18 @@ MIN_PLAN_GAIN = 2e-3
 """A motion must lower the sum of logarithms of excess over tolerance by so much to be worth it, near the goal by this share of it."""
 
 
-class Offers:
+class CandidateMotions:
     """The gain of every motion from where the joints are."""
 
-    def __init__(self, situation: Situation, belief: Belief, place: int, *, margin: float = 1.0, factor: float = 1.0):
-        self.places = situation.repertoire.place_of
-        self.seconds = situation.seconds + situation.way_seconds[place, self.places]
-        size = belief.size
-        self.information = (situation.information + situation.way_information(place)) / factor
+    def __init__(self, problem: PlanningProblem, posterior: Posterior, place: int, *, margin: float = 1.0, factor: float = 1.0):
+        self.places = problem.library.place_of
+        self.seconds = problem.seconds + problem.way_seconds[place, self.places]
+        size = posterior.size
+        self.information = (problem.information + problem.way_information(place)) / factor
         self.possible = self.seconds > 0
-        after = belief.after(self.information, self.seconds)
-        before = situation.goal.left(belief.known[None], margin)[0]
-        self.left = situation.goal.left(after[:, :size, :size], margin)
+        after = posterior.after(self.information, self.seconds)
+        before = problem.goal.left(posterior.known[None], margin)[0]
+        self.left = problem.goal.left(after[:, :size, :size], margin)
         self.gain = np.where(self.possible, before - self.left, 0.0)
         self.least = MIN_PLAN_GAIN * min(1.0, float(before))
 
@@ -58,14 +58,14 @@ class Offers:
         return int(np.argmax(np.where(self.possible, self.gain / np.maximum(self.seconds, 1e-9), -np.inf)))
 
 
-def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None, first: Sequence[int] = (),
+def greedy(problem: PlanningProblem, start: int, *, known: np.ndarray | None = None, first: Sequence[int] = (),
            longest: float = np.inf) -> list[int]:
     """
     Return motions that reach the goal, or the smallest distance to it, each with the best gain per second at its step.
 
     Parameters
     ----------
-    situation : Situation
+    problem : PlanningProblem
     start : int
         Place where the joints are.
     known : ndarray, optional
@@ -76,44 +76,44 @@ def greedy(situation: Situation, start: int, *, known: np.ndarray | None = None,
         Time at most, s.
 
     """
-    belief, place, chosen, spent, margin, factor = situation.belief(known), start, [], 0.0, 1.0, 0.0
+    posterior, place, chosen, spent, margin, factor = problem.posterior(known), start, [], 0.0, 1.0, 0.0
     taken: list[tuple[np.ndarray, float]] = []
-    beginning = situation.goal.left(belief.known[None])[0]
+    beginning = problem.goal.left(posterior.known[None])[0]
     while len(chosen) < MAX_PLAN_MOTIONS and spent < longest:
-        if factor != (factor := situation.variance_factor(situation.timed(chosen, start)[0], known)):
-            belief = situation.belief(known)
+        if factor != (factor := problem.variance_factor(problem.timed(chosen, start)[0], known)):
+            posterior = problem.posterior(known)
             for information, seconds in taken:
-                belief.take(information / factor, seconds)
-        choice = Offers(situation, belief, place, margin=margin, factor=factor)
+                posterior.take(information / factor, seconds)
+        choice = CandidateMotions(problem, posterior, place, margin=margin, factor=factor)
         must = len(chosen) < len(first)
         number = first[len(chosen)] if must else choice.best
         if not must and (choice.hopeless(number) or spent + float(choice.seconds[number]) > longest):
             break
         taken.append((factor * choice.information[number], float(choice.seconds[number])))
-        belief.take(choice.information[number], taken[-1][1])
+        posterior.take(choice.information[number], taken[-1][1])
         chosen.append(number)
         spent += float(choice.seconds[number])
-        place = int(situation.repertoire.place_of[number])
-        left = situation.goal.left(belief.known[None], margin)[0]
+        place = int(problem.library.place_of[number])
+        left = problem.goal.left(posterior.known[None], margin)[0]
         report('planning', 1.0 - left / max(beginning, 1e-9), 1.0)
         if left == 0.0 and len(chosen) >= len(first):
-            if meets(situation, chosen, start, known=known):
+            if meets(problem, chosen, start, known=known):
                 break
             # The belief has constant biases within a motion; if that was optimistic, the target must be lower.
             margin *= FURTHER
     return chosen
 
 
-def meets(situation: Situation, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None) -> bool:
+def meets(problem: PlanningProblem, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None) -> bool:
     """Return whether motions reach the goal."""
-    return bool(situation.goal.left(situation.covariance_after(sequence, start, known, cautious=True)[0][None])[0] == 0.0)
+    return bool(problem.goal.left(problem.covariance_after(sequence, start, known, cautious=True)[0][None])[0] == 0.0)
 
 
-def exchanged(situation: Situation, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None,
+def exchanged(problem: PlanningProblem, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None,
               fixed: int = 0) -> list[int]:
     """Return a shorter plan that does as much: motions are left out, latest first and none of the first `fixed`."""
     def left(trial):
-        return float(situation.goal.left(situation.covariance_after(trial, start, known, cautious=True)[0][None])[0])
+        return float(problem.goal.left(problem.covariance_after(trial, start, known, cautious=True)[0][None])[0])
 
     best, goal = list(sequence), left(sequence) + 1e-9
     for place in range(len(best) - 1, fixed - 1, -1):
@@ -206,45 +206,45 @@ class Planner:
 
     Parameters
     ----------
-    situation : Situation
+    problem : PlanningProblem
         Motions, model in tolerances, noise.
     known : ndarray, optional
         Information about the coordinates in addition to the prior.
 
     """
 
-    def __init__(self, situation: Situation, known: np.ndarray | None = None):
-        self.situation, self.known = situation, known
-        self._belief = situation.belief(known)
+    def __init__(self, problem: PlanningProblem, known: np.ndarray | None = None):
+        self.problem, self.known = problem, known
+        self._posterior = problem.posterior(known)
         self._visited: set[int] = set()
         self._first: list[int] | None = None if known is None else []
 
     def take(self, calibration: Calibration) -> None:
         """Replace the prediction by the covariance of a calibration, for the parameters that the model shares with it."""
         names = {name: k for k, name in enumerate(calibration.param_names)}
-        self.known = self.situation.coordinates.information_from(names, calibration.covariance)
-        self._belief = self.situation.belief(self.known)
+        self.known = self.problem.coordinates.information_from(names, calibration.covariance)
+        self._posterior = self.problem.posterior(self.known)
 
     @property
     def excess(self) -> dict[str, float]:
         """Standard deviation over tolerance of each requested parameter, estimated or predicted."""
-        coordinates = self.situation.coordinates
+        coordinates = self.problem.coordinates
         names = np.array(coordinates.model.param_names)[coordinates.wanted]
-        return dict(zip(names.tolist(), coordinates.excess(self._belief.known).tolist(), strict=True))
+        return dict(zip(names.tolist(), coordinates.excess(self._posterior.known).tolist(), strict=True))
 
     def next_motion(self, position: np.ndarray) -> NextMotion:
         """Return the motion with the largest gain per second from where the joints are, and count on it."""
-        missing = self.situation.goal.missing(self._belief.known)
-        place = self.situation.place_near(position)
+        missing = self.problem.goal.missing(self._posterior.known)
+        place = self.problem.place_near(position)
         if self._first is None:
-            self._first = [] if self.known is not None else self.situation.first_rests(place)
-        if not self._first and not self.situation.goal.left(self._belief.known[None])[0] > 0:
+            self._first = [] if self.known is not None else self.problem.first_rests(place)
+        if not self._first and not self.problem.goal.left(self._posterior.known[None])[0] > 0:
             return NextMotion(None, STUCK if missing else GOAL_REACHED, missing=missing)
-        choice, must = Offers(self.situation, self._belief, place), bool(self._first)
+        choice, must = CandidateMotions(self.problem, self._posterior, place), bool(self._first)
         number = self._first.pop(0) if must else choice.best
         if not must and self._visited and choice.hopeless(number):
             return NextMotion(None, STUCK, missing=missing)
-        self._belief.take(choice.information[number], float(choice.seconds[number]))
+        self._posterior.take(choice.information[number], float(choice.seconds[number]))
         motion = self._named(number)
         reason = 'a session begins with rests in many attitudes' if must else f'it gains most per second for {", ".join(missing[:3])}'
         return NextMotion(motion, reason, motion.seconds_from(position), missing)
@@ -253,72 +253,72 @@ class Planner:
         """Return a motion of every joint by at most `reach` (rad or m, shape (n_joints,)) to the wider side and back; None for zero."""
         if not np.any(reach):
             return None
-        repertoire = self.situation.repertoire
-        limits = repertoire.limits
+        library = self.problem.library
+        limits = library.limits
         room = np.stack([position - limits.lower, limits.upper - position])
         away = np.where(room[1] >= room[0], 1.0, -1.0) * np.clip(room.max(axis=0), 0.0, reach)
         builder = MotionBuilder(len(position), limits=limits, start=position)
         for place in (position + away, position):
             builder.move_to(place)
-        return PlannedMotion(MotionKind.MOVE, repertoire.names, np.asarray(position, float), tuple(builder.segments),
+        return PlannedMotion(MotionKind.MOVE, library.names, np.asarray(position, float), tuple(builder.segments),
                              'a small motion of every joint and back', limits)
 
     def unwinding(self, position: np.ndarray) -> PlannedMotion | None:
         """Return the move that turns endless joints with restricted turns back to the middle of their range; None within half a turn."""
-        repertoire = self.situation.repertoire
-        limits, declared = repertoire.limits, limits_of(repertoire.table).endless
+        library = self.problem.library
+        limits, declared = library.limits, limits_of(library.table).endless
         middle = np.where(declared & ~limits.endless, 0.5 * (limits.lower + limits.upper), position)
         far = np.abs(position - middle) > np.pi
         if not np.any(far):
             return None
-        return PlannedMotion(MotionKind.MOVE, repertoire.names, np.where(far, middle, position), (), 'unwinding', limits)
+        return PlannedMotion(MotionKind.MOVE, library.names, np.where(far, middle, position), (), 'unwinding', limits)
 
     def plan(self, position: np.ndarray | None = None, *, with_bound: bool = True, longest: float = np.inf) -> Plan:
         """Return a whole plan from the present position (default: home)."""
-        situation = self.situation
-        start = situation.repertoire.spread[0] if position is None else np.asarray(position, float)
-        place = situation.place_near(start)
-        first = () if self.known is not None else situation.first_rests(place)
+        problem = self.problem
+        start = problem.library.spread[0] if position is None else np.asarray(position, float)
+        place = problem.place_near(start)
+        first = () if self.known is not None else problem.first_rests(place)
         self.within(longest)
         sequence = self._sequence(place, first, longest)
-        bound, goal = float('nan'), situation.goal
+        bound, goal = float('nan'), problem.goal
         if with_bound and isinstance(goal, WithinTolerances):
-            windows, _, seconds = situation.timed(sequence, place)
-            factor = situation.variance_factor(windows, self.known)
-            relaxed = situation.relaxation(self.known, factor=factor)
-            bound = situation.lower_bound(self.known, factor=factor, relaxed=relaxed)
+            windows, _, seconds = problem.timed(sequence, place)
+            factor = problem.variance_factor(windows, self.known)
+            relaxed = problem.relaxation(self.known, factor=factor)
+            bound = problem.lower_bound(self.known, factor=factor, relaxed=relaxed)
             if seconds > MAX_BOUND_RATIO * bound:   # what limits the relaxed plan counts more: a second attempt
                 weights = np.maximum(relaxed.weights / relaxed.weights.max(), MIN_RELATIVE_WEIGHT)
-                situation.goal = WithinTolerances(situation.coordinates, weights)
+                problem.goal = WithinTolerances(problem.coordinates, weights)
                 other = self._sequence(place, first, longest)
-                situation.goal = goal
-                windows, _, less = situation.timed(other, place)
-                if less < seconds and meets(situation, other, place, known=self.known):
-                    sequence, bound = other, situation.lower_bound(self.known, factor=situation.variance_factor(windows, self.known))
+                problem.goal = goal
+                windows, _, less = problem.timed(other, place)
+                if less < seconds and meets(problem, other, place, known=self.known):
+                    sequence, bound = other, problem.lower_bound(self.known, factor=problem.variance_factor(windows, self.known))
         return self._plan_of(sequence, start, place, bound)
 
     def _sequence(self, place, first, longest):
-        sequence = greedy(self.situation, place, known=self.known, first=first, longest=longest)
-        return exchanged(self.situation, sequence, place, known=self.known, fixed=len(first))
+        sequence = greedy(self.problem, place, known=self.known, first=first, longest=longest)
+        return exchanged(self.problem, sequence, place, known=self.known, fixed=len(first))
 
     def within(self, seconds: float) -> None:
         """Drop causes that no plan of this time separates."""
-        if isinstance(self.situation.goal, ToldApart) and np.isfinite(seconds):
-            self.situation.goal.leave_out_of_reach(self.situation.best_covariance(seconds, self.known))
+        if isinstance(self.problem.goal, ToldApart) and np.isfinite(seconds):
+            self.problem.goal.leave_out_of_reach(self.problem.best_covariance(seconds, self.known))
 
     def _plan_of(self, sequence, start, place, bound):
-        situation, coordinates = self.situation, self.situation.coordinates
-        covariance, cautious = (situation.covariance_after(sequence, place, self.known, cautious=each)[0] for each in (False, True))
-        steps = [situation.covariance_after(sequence[:count], place, self.known) for count in range(len(sequence) + 1)]
+        problem, coordinates = self.problem, self.problem.coordinates
+        covariance, cautious = (problem.covariance_after(sequence, place, self.known, cautious=each)[0] for each in (False, True))
+        steps = [problem.covariance_after(sequence[:count], place, self.known) for count in range(len(sequence) + 1)]
         self._visited.clear()
         return Plan(coordinates.model, tuple(self._named(number) for number in sequence), np.array([seconds for _, seconds in steps[1:]]),
                     coordinates.sd(covariance), coordinates.tolerances, coordinates.wanted,
-                    coordinates.excess(np.array([step for step, _ in steps])), situation.goal.missing(cautious), start, bound,
-                    situation.goal.words)
+                    coordinates.excess(np.array([step for step, _ in steps])), problem.goal.missing(cautious), start, bound,
+                    problem.goal.words)
 
     def _named(self, number: int) -> PlannedMotion:
         """Return a motion of the repertoire; a rest where there was one already is a return."""
-        motion, place = self.situation.motions[number], int(self.situation.repertoire.place_of[number])
+        motion, place = self.problem.motions[number], int(self.problem.library.place_of[number])
         if motion.kind is MotionKind.POSE:
             motion = replace(motion, kind=MotionKind.RETURN) if place in self._visited else motion
             self._visited.add(place)
@@ -353,7 +353,7 @@ def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: d
     coordinates = Coordinates(model, tolerances_of(model, tolerances or options.tolerances), values)
     step = table.joint_noise_rad or 0.0
     beside = {sensor: replace(own, reference=ReferenceNoise.of_steps(step, sensor)) for sensor, own in noise.items()}
-    planner = Planner(Situation(Repertoire(table, limits or limits_of(table)), coordinates, beside, rate=rate))
+    planner = Planner(PlanningProblem(MotionLibrary(table, limits or limits_of(table)), coordinates, beside, rate=rate))
     if calibration is not None:
         planner.take(calibration)
     return planner

@@ -123,7 +123,7 @@ WORDS = {'accelerometer': ('specific force at rest', 'gravity in the attitudes o
 
 
 class Reduced(Protocol):
-    """Reduced data of a recording: `Gathered`."""
+    """Reduced data of a recording: `SessionData`."""
 
     @property
     def accumulator(self) -> Any:

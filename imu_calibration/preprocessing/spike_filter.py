@@ -121,9 +121,9 @@ class SpikeFilter:
         steps = np.minimum.accumulate(np.vstack([self._step, steps]))[1:]
         usual = _NORMAL * np.median(parts, axis=1)
         # a constant output (clipped, frozen, coarse) has no noise estimate: the previous one is kept
-        told = np.vstack([self._noise[-1:], usual])
-        last = np.maximum.accumulate(np.where(told > 0, np.arange(len(told))[:, None], 0))
-        usual = np.take_along_axis(told, last, axis=0)[1:]
+        known = np.vstack([self._noise[-1:], usual])
+        last = np.maximum.accumulate(np.where(known > 0, np.arange(len(known))[:, None], 0))
+        usual = np.take_along_axis(known, last, axis=0)[1:]
         noise = np.maximum(np.maximum(usual, np.where(np.isfinite(steps), steps, 0.0)), NOISE_ROUNDING * np.abs(np.median(values, axis=1)))
         self._noise, self._n_noise, self._step = np.vstack([self._noise, noise]), self._n_noise + len(noise), steps[-1]
 

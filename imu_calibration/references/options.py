@@ -11,7 +11,7 @@ from imu_calibration.effects.sensor_model import DEFAULT_MODEL, SensorModel, par
 from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowSettings
-from imu_calibration.references.turntable.gathered import Gathered
+from imu_calibration.references.turntable.session_data import SessionData
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
                                  **{name: value for name, value in options.point.items() if any(e.name == name for e in model.effects)}})
 
 
-def settle_model(model: SensorModel, options: CalibrationOptions, gathered: Gathered) -> SensorModel:
+def settle_model(model: SensorModel, options: CalibrationOptions, gathered: SessionData) -> SensorModel:
     """Return the model without the size effect if it was not requested and the recording has no rotation that determines it."""
     if options.accelerometer_model is not None:
         return model

@@ -12,8 +12,8 @@ from imu_calibration.calibration.hand_step import HandStep, direction_words
 from imu_calibration.core.units import for_people
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.rotations import align
+from imu_calibration.planning.motion_library import MotionKind
 from imu_calibration.planning.planner import Plan
-from imu_calibration.planning.repertoire import MotionKind
 from imu_calibration.report.figures import AXIS_COLOURS, FAINT, GREY, INK, Drawn, draw, log_axis
 from imu_calibration.report.page import render, text, tile
 

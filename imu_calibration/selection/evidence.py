@@ -226,11 +226,11 @@ class WindowEvidence(Evidence):
         sd = np.sqrt(np.diag(covariance)[places])
         moved = slopes[:, list(used)] @ (covariance[:, places] / sd)
         sizes, directions = np.linalg.eigh(moved.T @ moved)
-        told = sizes > CONVENTION_SHARE * sizes[-1]   # without unobservable directions: compliances in no pose, arms that cancel
-        n_windows, n_own = len(moved), int(told.sum())
+        observable = sizes > CONVENTION_SHARE * sizes[-1]   # without unobservable directions: compliances in no pose, arms that cancel
+        n_windows, n_own = len(moved), int(observable.sum())
         if n_windows - n_own < LEAST_SCATTER:
             return 0.0
-        t_squared = ((directions.T @ (values[places] / sd))[told]**2 / sizes[told]).sum()
+        t_squared = ((directions.T @ (values[places] / sd))[observable]**2 / sizes[observable]).sum()
         return float(f_sf((n_windows - n_own) / (n_own * (n_windows - 1)) * t_squared, n_own, n_windows - n_own))
 
 

@@ -44,7 +44,7 @@ class Explained:
 
     def excess(self, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
         """Return sensor -> held-out loss minus its expectation from noise, of each part and axis, shape (n_parts, n_axes)."""
-        losses = self.losses(self.search.used(chosen))
+        losses = self.losses(self.search.indices(chosen))
         return {sensor: parts - self.numbers[sensor][:, None] / parts.shape[1] for sensor, parts in losses.items()}
 
     def sigma(self, sensor: str, excess: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.questions import Question
 
 WINDOW_RESAMPLES = 1000
@@ -52,7 +52,7 @@ class Gain:
         return 1.0 - self.heldout_rms_after / self.heldout_rms_before if self.heldout_rms_before > 0 else 0.0
 
 
-def heldout_gain(attempt: Attempt, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
+def heldout_gain(problem: LinearisedProblem, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
     """
     Return the Gain of the choice `after` over the choice `before` on the locked windows, which are used only here.
 
@@ -60,34 +60,34 @@ def heldout_gain(attempt: Attempt, before: Sequence[Question], after: Sequence[Q
 
     Parameters
     ----------
-    attempt : Attempt
+    problem : LinearisedProblem
     before, after : sequence of Question
     sensors : sequence of str
         Sensors that the difference acts on; the one with the larger reduction is reported.
 
     """
-    told = gain_in_turn(attempt, before, after, sensors=sensors)
-    used = map(attempt.search.used, (before, after))
-    values = [attempt.space.reduced(some, attempt.evidence.fit(some)[0])[None] for some in used]
-    return gain_of(told.sensor, told.measure, [_squares(attempt.locked_samples, each, told.sensor)[told.measure] for each in values])
+    gain = gain_in_turn(problem, before, after, sensors=sensors)
+    used = map(problem.search.indices, (before, after))
+    values = [problem.space.reduced(some, problem.evidence.fit(some)[0])[None] for some in used]
+    return gain_of(gain.sensor, gain.measure, [_squares(problem.locked_samples, each, gain.sensor)[gain.measure] for each in values])
 
 
-def gain_in_turn(attempt: Attempt, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
+def gain_in_turn(problem: LinearisedProblem, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
     """
     Return the same Gain on the selection windows by cross-validation.
 
     Returned is the measure with the largest reduction; if that is uncertain, the one with the surest: a small lag may reduce window means
     by a tenth through noise, and samples by a certain half percent. For a quiet sensor moving windows show the encoder, rests the sensor.
     """
-    found, fold = [], attempt.evidence.fold
+    found, fold = [], problem.evidence.fold
     for sensor in sensors:
         pair = []
-        for used in map(attempt.search.used, (before, after)):
-            values = np.array([attempt.space.reduced(used, attempt.evidence.fit(used, number)[0]) for number in range(fold.max() + 1)])
-            pair.append(_squares(attempt.all_samples, values[fold], sensor))
+        for used in map(problem.search.indices, (before, after)):
+            values = np.array([problem.space.reduced(used, problem.evidence.fit(used, number)[0]) for number in range(fold.max() + 1)])
+            pair.append(_squares(problem.all_samples, values[fold], sensor))
         of = {measure: [squares[measure] for squares in pair] for measure in MEASURES}
         found += [(gain_of(sensor, measure, each), _certainty(each)) for measure, each in of.items()]
-    most = max((told for told, _ in found if told.measure != REST_MEASURE), key=lambda told: told.least)
+    most = max((gain for gain, _ in found if gain.measure != REST_MEASURE), key=lambda gain: gain.least)
     if most.least > 0:
         return most
     return max(found, key=lambda entry: (not np.isinf(entry[0].least), entry[1]))[0]

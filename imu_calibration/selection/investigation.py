@@ -11,16 +11,16 @@ from imu_calibration.effects.reference_effects import CLOCK, FAMILY
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.explained_share import ExplainedWindows, pruned, sensors_of
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.lag_explanations import lag_explanations
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.onset import Onset, find_onset
 from imu_calibration.selection.questions import Question, point_with, testable_effects, without_saturation
 from imu_calibration.selection.rivals import Rival, best_pairs, same_questions, settle_rivals, simpler
 from imu_calibration.selection.saturation import Saturation, windows_at, without_clipping
-from imu_calibration.selection.search import Named, Search
+from imu_calibration.selection.search import Search, SelectedEffects
 
 LINEARISATIONS = 5
 """Largest number of linearisations."""
@@ -31,12 +31,12 @@ LEFT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Investigation(Named):
+class Investigation(SelectedEffects):
     """Numerical result of a search, without sentences."""
 
     used: list[Window]
     """Windows that were fitted to, without clipped samples."""
-    attempt: Attempt
+    problem: LinearisedProblem
     """The last linearisation with its evidence."""
     explained: ExplainedWindows
     """Expected loss from noise and losses of choices."""
@@ -46,9 +46,9 @@ class Investigation(Named):
     """Saturations."""
     not_testable: list[dict]
     """Effects that could not be tested."""
-    denied: Sequence[Question] = field(default_factory=list)
+    unstable: Sequence[Question] = field(default_factory=list)
     """Questions that would have become findings, but the parts of the recording disagree on them."""
-    doubtful: Sequence[Question] = field(default_factory=list)
+    rejected: Sequence[Question] = field(default_factory=list)
     """Questions selected by likelihood but not named: their gain is too small, or the remaining excess too large."""
     rivals: Sequence[Rival] = field(default_factory=list)
     """Alternatives to findings that fit nearly as well."""
@@ -58,7 +58,7 @@ class Investigation(Named):
     @property
     def search(self) -> Search:
         """On which they were chosen."""
-        return self.attempt.search
+        return self.problem.search
 
 
 def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, bias_processes: dict | None = None) -> Investigation:
@@ -91,13 +91,13 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     used, locked, limits = without_clipping(used, table, model)
     effects, not_testable = testable_effects(model, table, windows_at(used, ~locked))
     asked = without_saturation(effects)
-    attempted = partial(Attempt, used, table, model, effects=asked, locked=locked, bias_processes=bias_processes)
-    attempt = attempted()
-    outcome, rivals, again = _explained(attempt, attempted)
-    onset = find_onset(outcome.attempt, outcome.explained, outcome.named, windows=used, table=table) if outcome.rest else None
+    linearised_at = partial(LinearisedProblem, used, table, model, effects=asked, locked=locked, bias_processes=bias_processes)
+    problem = linearised_at()
+    outcome, rivals, again = _explained(problem, linearised_at)
+    onset = find_onset(outcome.problem, outcome.explained, outcome.named, windows=used, table=table) if outcome.rest else None
     step = next((effect for effect in effects if effect.located), None)
     if onset is not None and onset.what == CLOCK and step is not None:
-        stepped = partial(attempted, effects=[*asked, step])
+        stepped = partial(linearised_at, effects=[*asked, step])
         there = stepped(point=point_with(model, [*asked, step], _as_step(step, onset)))
         other, others, beside = _explained(there, stepped, [question for question in there.questions if question.name == step.name])
         if other.rest < LEFT * outcome.rest:
@@ -105,14 +105,14 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     if onset is not None:
         longer = max([w for w in used if w.time[-1] < onset.time], [w for w in used if w.time[0] >= onset.time], key=len)
         return replace(investigate(longer, table, model, bias_processes=bias_processes), onset=onset)
-    attempted = again
+    linearised_at = again
     for any_size in (False, True):
-        outcome = _looked_again(outcome, partial(attempted, any_size=any_size), any_size)
-    attempt, named, denied = outcome.attempt, outcome.named, outcome.denied
+        outcome = _looked_again(outcome, partial(linearised_at, any_size=any_size), any_size)
+    problem, named, unstable = outcome.problem, outcome.named, outcome.unstable
     names = {question.name for question in named}
     rivals = [rival for rival in rivals if rival.question.name in names and rival.other.name not in names]
-    doubtful = [question for question in outcome.chosen if question not in (*named, *denied)]
-    return Investigation(used, attempt, outcome.explained, named, limits, not_testable, denied, doubtful, rivals)
+    rejected = [question for question in outcome.chosen if question not in (*named, *unstable)]
+    return Investigation(used, problem, outcome.explained, named, limits, not_testable, unstable, rejected, rivals)
 
 
 def _as_step(step, onset):
@@ -121,27 +121,27 @@ def _as_step(step, onset):
     return {name: before} | dict(zip(step.param_names(), (onset.after[name] - before, onset.time)))
 
 
-def _explained(attempt, attempted, start=()):
-    """Return (the _Outcome of a search, rivals of its findings, `attempted` with the lags resolved if there are any)."""
-    chosen = attempt.search.run(start)
-    chosen = [question for question in chosen if question.name not in FAMILY or attempt.windows_agree(chosen, question)]
-    explanations = lag_explanations(attempt, [*chosen, *attempt.search.early(chosen)], attempted)
+def _explained(problem, linearised_at, start=()):
+    """Return (the _Outcome of a search, rivals of its findings, `linearised_at` with the lags resolved if there are any)."""
+    chosen = problem.search.run(start)
+    chosen = [question for question in chosen if question.name not in FAMILY or problem.windows_agree(chosen, question)]
+    explanations = lag_explanations(problem, [*chosen, *problem.search.early(chosen)], linearised_at)
     if explanations is not None:
-        attempted = partial(attempted, resolved=FAMILY)
-        return *_with_lags(explanations, attempted), attempted
-    settled, rivals = settle_rivals(attempt, chosen, attempted)
-    return _settled(attempted, settled, chosen if settled is attempt else settled.search.run()), rivals, attempted
+        linearised_at = partial(linearised_at, resolved=FAMILY)
+        return *_with_lags(explanations, linearised_at), linearised_at
+    settled, rivals = settle_rivals(problem, chosen, linearised_at)
+    return _settled(linearised_at, settled, chosen if settled is problem else settled.search.run()), rivals, linearised_at
 
 
 @dataclass(frozen=True, eq=False)
 class _Outcome:
     """Result of a choice."""
 
-    attempt: Attempt
+    problem: LinearisedProblem
     explained: ExplainedWindows
     chosen: Sequence[Question]
     named: Sequence[Question]
-    denied: Sequence[Question]
+    unstable: Sequence[Question]
 
     @cached_property
     def rest(self):
@@ -149,7 +149,7 @@ class _Outcome:
         return self.explained.rest(self.named)
 
 
-def _with_lags(explanations, attempted):
+def _with_lags(explanations, linearised_at):
     """
     Return (the _Outcome with the simplest explanation of the lags all of which help, its rivals).
 
@@ -157,22 +157,22 @@ def _with_lags(explanations, attempted):
     """
     most, refused, tried = None, [], []
     for _ in range(EXPLANATIONS):
-        told = explanations.told(most, refused)
-        there, chosen, of_lags = explanations.settled(told, attempted)
+        selected = explanations.select(most, refused)
+        there, chosen, of_lags = explanations.settled(selected, linearised_at)
         chosen = there.search.run(chosen)
-        settled, rivals = settle_rivals(there, chosen, attempted)
-        outcome = _settled(attempted, settled, chosen if settled is there else _searched(settled, chosen))
-        most, refused = max(len(told.lags) - 1, 1), [*refused, told]
-        kept = [len(told.lags.keys() & {question.name for question in some}) for some in (outcome.named, outcome.chosen)]
+        settled, rivals = settle_rivals(there, chosen, linearised_at)
+        outcome = _settled(linearised_at, settled, chosen if settled is there else _searched(settled, chosen))
+        most, refused = max(len(selected.lags) - 1, 1), [*refused, selected]
+        kept = [len(selected.lags.keys() & {question.name for question in some}) for some in (outcome.named, outcome.chosen)]
         tried.append((kept, outcome, [*of_lags, *rivals]))
-        if kept[0] == len(told.lags):
+        if kept[0] == len(selected.lags):
             return tried[-1][1:]
         if not explanations.others(most, refused):
             break
     return max(tried, key=lambda entry: entry[0])[1:]
 
 
-def _looked_again(outcome, attempted, any_size):
+def _looked_again(outcome, linearised_at, any_size):
     """
     Return the _Outcome of the searches for the cause of a remaining significant excess.
 
@@ -181,46 +181,46 @@ def _looked_again(outcome, attempted, any_size):
     """
     if not outcome.rest:
         return outcome
-    attempt = outcome.attempt.asking_any_size() if any_size else outcome.attempt
-    search, known = attempt.search, {question.label for question in outcome.chosen}
-    lags = _resolved(attempt, outcome.chosen)
+    problem = outcome.problem.asking_any_size() if any_size else outcome.problem
+    search, known = problem.search, {question.label for question in outcome.chosen}
+    lags = _resolved(problem, outcome.chosen)
     found = [search.run([*lags, *start]) for start in ((), *best_pairs(search))]
     best = min(found, key=search.cost)
     if {question.label for question in best} == known or (not any_size and search.cost(best) >= search.cost(outcome.chosen)):
         return outcome
-    other = _settled(attempted, attempt, best)
+    other = _settled(linearised_at, problem, best)
     return other if other.rest < LEFT * outcome.rest else outcome
 
 
-def _settled(attempted, attempt, chosen):
+def _settled(linearised_at, problem, chosen):
     """Return the _Outcome of a choice: relinearise at the effects, then keep the ones with sufficient share and gain."""
     for _ in range(LINEARISATIONS - 1):
-        if not attempt.needs_another(chosen):
+        if not problem.needs_another(chosen):
             break
-        attempt = attempted(point=attempt.point(chosen))
-        chosen = _searched(attempt, chosen)
+        problem = linearised_at(point=problem.point(chosen))
+        chosen = _searched(problem, chosen)
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
-    explained = ExplainedWindows(attempt.evidence, attempt.search)
-    first = simpler(attempt, explained, pruned(chosen, explained.share))
-    named, denied = _agreed(attempt, explained, _that_help(attempt, explained, first))
+    explained = ExplainedWindows(problem.evidence, problem.search)
+    first = simpler(problem, explained, pruned(chosen, explained.share))
+    named, unstable = _agreed(problem, explained, _that_help(problem, explained, first))
     for _ in range(LINEARISATIONS - 1):
-        if not attempt.acts_beside(named):
+        if not problem.acts_beside(named):
             break
-        attempt = attempted(point=attempt.point(named))
-        explained = ExplainedWindows(attempt.evidence, attempt.search)
-        again, denied, chosen = (same_questions(attempt, some) for some in (named, denied, chosen))
-        named = _that_help(attempt, explained, pruned(again, explained.share))
-    return _Outcome(attempt, explained, chosen, named, denied)
+        problem = linearised_at(point=problem.point(named))
+        explained = ExplainedWindows(problem.evidence, problem.search)
+        again, unstable, chosen = (same_questions(problem, some) for some in (named, unstable, chosen))
+        named = _that_help(problem, explained, pruned(again, explained.share))
+    return _Outcome(problem, explained, chosen, named, unstable)
 
 
-def _searched(attempt, chosen):
+def _searched(problem, chosen):
     """Return the choice of a search at another linearisation; it starts from the resolved effects."""
-    return attempt.search.run(_resolved(attempt, chosen))
+    return problem.search.run(_resolved(problem, chosen))
 
 
-def _resolved(attempt, chosen):
-    return same_questions(attempt, [question for question in chosen if question.name in attempt.search.resolved])
+def _resolved(problem, chosen):
+    return same_questions(problem, [question for question in chosen if question.name in problem.search.resolved])
 
 
 def too_few_windows(count: int) -> NotObservableError:
@@ -230,14 +230,14 @@ def too_few_windows(count: int) -> NotObservableError:
                               code='too_few_windows')
 
 
-def _agreed(attempt, explained, named):
+def _agreed(problem, explained, named):
     """Return (findings on which both halves agree and that hold without the other ones, findings on which the halves disagree)."""
-    denied = [question for question in named if not attempt.agrees_in_halves(named, question)]
-    kept = [question for question in named if question not in denied]
-    return attempt.search.standing(_that_help(attempt, explained, kept) if denied else kept), denied
+    unstable = [question for question in named if not problem.agrees_in_halves(named, question)]
+    kept = [question for question in named if question not in unstable]
+    return problem.search.drop_insignificant(_that_help(problem, explained, kept) if unstable else kept), unstable
 
 
-def _that_help(attempt, explained, named):
+def _that_help(problem, explained, named):
     """
     Return the admissible findings that improve cross-validated prediction, by backward elimination of the least helpful.
 
@@ -245,29 +245,29 @@ def _that_help(attempt, explained, named):
     evidence for any effect that correlates with it. So the unweighted residual must decrease too. The locked windows are not
     used: their later gain would be biased.
     """
-    kept = [question for question in named if attempt.search.allowed(named, question) and attempt.windows_agree(named, question)]
+    kept = [question for question in named if problem.search.allowed(named, question) and problem.windows_agree(named, question)]
     while kept:
-        least = [_sure_reduction(attempt, kept, each) for each in kept]
-        short = [not paid > _needed_reduction(attempt, explained, kept, each) for paid, each in zip(least, kept)]   # nan is not sure
+        least = [_sure_reduction(problem, kept, each) for each in kept]
+        short = [not paid > _needed_reduction(problem, explained, kept, each) for paid, each in zip(least, kept)]   # nan is not sure
         if not any(short):
             break
         del kept[int(np.argmin(np.where(short, np.nan_to_num(least, nan=-np.inf), np.inf)))]
     return kept
 
 
-def _needed_reduction(attempt, explained, chosen, question):
+def _needed_reduction(problem, explained, chosen, question):
     """
     Return the required relative reduction of the residual.
 
     Zero; `LEAST_REDUCTION` with an unexplained excess, or without rests to separate misfit from noise.
     """
-    clear = not attempt.recording.moving.all() and not explained.rest_beside(chosen, question)
+    clear = not problem.recording.moving.all() and not explained.rest_beside(chosen, question)
     return 0.0 if clear else LEAST_REDUCTION
 
 
-def _sure_reduction(attempt, chosen, question):
+def _sure_reduction(problem, chosen, question):
     """Return the lower end of the interval of an effect's reduction of the cross-validated residual."""
-    return gain_in_turn(attempt, [q for q in chosen if q is not question], chosen, sensors=sensors_of(question.effect)).ci95[0]
+    return gain_in_turn(problem, [q for q in chosen if q is not question], chosen, sensors=sensors_of(question.effect)).ci95[0]
 
 
 def with_joints_of(model: SensorModel, table: Table) -> SensorModel:

@@ -15,8 +15,8 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.reference_effects import CLOCK, CLOCKS, FAMILY, lag_name
-from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import WindowEvidence
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.questions import Question, point_with
 from imu_calibration.selection.rivals import MIN_CURVATURE_NATS, Rival, same_questions
 from imu_calibration.selection.search import PENALTY, TIE
@@ -36,11 +36,11 @@ DELAY_LINEARISATIONS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class LagHypothesis:
     """One description of both sensors' lags at once, linearised where it is."""
 
     kind: tuple[str, ...]
-    attempt: Attempt
+    problem: LinearisedProblem
     chosen: list[Question]
     """The lags of both sensors, then the other chosen effects."""
 
@@ -48,14 +48,14 @@ class Told:
     def values(self) -> dict[str, float]:
         """Parameter of the baseline, of the lags and of clocks that change -> value."""
         lags = FAMILY | CLOCKS
-        names = {*self.attempt.baseline.param_names, *(name for q in self.chosen if q.name in lags for name in q.effect.param_names())}
-        return {name: value for name, value in zip(self.attempt.space.names, self.attempt.values(self.chosen)) if name in names}
+        names = {*self.problem.baseline.param_names, *(name for q in self.chosen if q.name in lags for name in q.effect.param_names())}
+        return {name: value for name, value in zip(self.problem.space.names, self.problem.values(self.chosen)) if name in names}
 
     def lags(self, sensor: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, covariance) of the lags of one sensor, in the order of the kind."""
         wanted = [lag_name(sensor, ending) for ending in self.kind]
-        used = self.attempt.search.used(self.chosen)
-        values, covariance = self.attempt.evidence.fit(used)
+        used = self.problem.search.indices(self.chosen)
+        values, covariance = self.problem.evidence.fit(used)
         at = [used.index(q.parameters[0]) for name in wanted for q in self.chosen if q.name == name]
         return values[at], covariance[np.ix_(at, at)]
 
@@ -86,7 +86,7 @@ class Explanation:
 class LagExplanations:
     """All explanations of the lags of a recording."""
 
-    attempt: Attempt
+    problem: LinearisedProblem
     """Linearised where no lag acts."""
     explanations: Sequence[Explanation]
     rest: Sequence[Question]
@@ -99,44 +99,44 @@ class LagExplanations:
         costs = {each.cost for each in refused}
         return [each for each in self.explanations if (most is None or len(each.lags) <= most) and each.cost not in costs]
 
-    def told(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> Explanation:
+    def select(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> Explanation:
         """Return the simplest explanation of `others`."""
         return simplest(self.others(most, refused), self.silent)
 
-    def settled(self, told: Explanation, attempted: Callable) -> tuple[Attempt, list[Question], list[Rival]]:
-        """Return (the Attempt at an explanation, the choice with it, alternatives to its members that fit nearly as well)."""
-        names = {effect.name: effect.param_names()[0] for effect in self.attempt.effects}
-        values = told.values | {names[name]: value for name, value in told.lags.items()}
-        there = attempted(point=point_with(self.attempt.baseline, self.attempt.effects, values))
-        lags = [next(question for question in there.questions if question.name == name) for name in told.lags]
-        near = [explanation for explanation in self.explanations if explanation.cost < told.cost + TIE]
-        return there, [*lags, *same_questions(there, self.rest)], _rivals(there, told, near)
+    def settled(self, selected: Explanation, linearised_at: Callable) -> tuple[LinearisedProblem, list[Question], list[Rival]]:
+        """Return (the LinearisedProblem at an explanation, the choice with it, alternatives to its members that fit nearly as well)."""
+        names = {effect.name: effect.param_names()[0] for effect in self.problem.effects}
+        values = selected.values | {names[name]: value for name, value in selected.lags.items()}
+        there = linearised_at(point=point_with(self.problem.baseline, self.problem.effects, values))
+        lags = [next(question for question in there.questions if question.name == name) for name in selected.lags]
+        near = [explanation for explanation in self.explanations if explanation.cost < selected.cost + TIE]
+        return there, [*lags, *same_questions(there, self.rest)], _rivals(there, selected, near)
 
 
-def lag_explanations(attempt: Attempt, chosen: Sequence[Question], attempted: Callable) -> LagExplanations | None:
+def lag_explanations(problem: LinearisedProblem, chosen: Sequence[Question], linearised_at: Callable) -> LagExplanations | None:
     """
     Return the LagExplanations of a choice; None where it has no lag, no lag explains the data, or some of the family cannot be tested.
 
     Parameters
     ----------
-    attempt : Attempt
+    problem : LinearisedProblem
         Linearised where no lag acts.
     chosen : sequence of Question
-    attempted : callable
-        ``attempted(point=..., effects=...)``: the Attempt elsewhere, with some of the effects.
+    linearised_at : callable
+        ``linearised_at(point=..., effects=...)``: the LinearisedProblem elsewhere, with some of the effects.
 
     """
     rest = [question for question in chosen if question.name not in FAMILY and '@' not in question.label]
-    effects = {effect.name: effect for effect in attempt.effects}
+    effects = {effect.name: effect for effect in problem.effects}
     if not {question.name for question in chosen} & FAMILY or not FAMILY <= set(effects):
         return None
-    described = _described(attempt, attempted, effects, rest=rest, clocks=_clocks(attempt, chosen))
-    judges = [each.attempt for each in described]
+    described = _described(problem, linearised_at, effects, rest=rest, clocks=_clocks(problem, chosen))
+    judges = [each.problem for each in described]
     names = [name for name in described[0].values if name.split('.')[1] not in FAMILY]
     explanations = _explanations(described, judges, names)
     if not explanations:
         return None
-    return LagExplanations(attempt, explanations, rest, _silence(described, judges) if attempt.recording.moving.all() else None)
+    return LagExplanations(problem, explanations, rest, _silence(described, judges) if problem.recording.moving.all() else None)
 
 
 def simplest(explanations: Sequence[Explanation], silent: float | None = None) -> Explanation:
@@ -152,30 +152,30 @@ def simplest(explanations: Sequence[Explanation], silent: float | None = None) -
 
     """
     best = min(explanation.cost for explanation in explanations)
-    told = min((explanation for explanation in explanations if explanation.cost < best + TIE), key=lambda explanation: explanation.rank)
-    if silent is None or len(told.lags) < 2 or CLOCK in told.lags:
-        return told
-    common = [explanation for explanation in explanations if CLOCK in explanation.lags and len(explanation.lags) == len(told.lags)
+    selected = min((explanation for explanation in explanations if explanation.cost < best + TIE), key=lambda explanation: explanation.rank)
+    if silent is None or len(selected.lags) < 2 or CLOCK in selected.lags:
+        return selected
+    common = [explanation for explanation in explanations if CLOCK in explanation.lags and len(explanation.lags) == len(selected.lags)
               and explanation.cost < best + TIE + MAX_CLOCK_LOSS * (silent - best)]
-    return simplest(common) if common else told
+    return simplest(common) if common else selected
 
 
-def _clocks(attempt, chosen):
+def _clocks(problem, chosen):
     """Return parameter -> value of the chosen clocks that change, None without one: their lags are nonlinear at zero."""
-    values, clocks = attempt.values(chosen), [question for question in chosen if question.name in CLOCKS]
-    return {attempt.space.names[k]: float(values[k]) for question in clocks for k in question.parameters} or None
+    values, clocks = problem.values(chosen), [question for question in chosen if question.name in CLOCKS]
+    return {problem.space.names[k]: float(values[k]) for question in clocks for k in question.parameters} or None
 
 
-def _described(attempt, attempted, effects, *, rest, clocks):
+def _described(problem, linearised_at, effects, *, rest, clocks):
     """Return the description of each kind; only the first if no curvature is observable."""
     def at(kind, values=clocks):
         asked = [effects[lag_name(sensor, ending)] for ending in kind for sensor in SENSORS] + [question.effect for question in rest]
-        there = attempted(effects=asked, point=None if values is None else point_with(attempt.baseline, asked, values))
+        there = linearised_at(effects=asked, point=None if values is None else point_with(problem.baseline, asked, values))
         lags = [q for ending in kind for sensor in SENSORS for q in there.questions if q.name == lag_name(sensor, ending)]
-        return Told(kind, there, [*lags, *same_questions(there, rest)])
+        return LagHypothesis(kind, there, [*lags, *same_questions(there, rest)])
 
     first = at(DELAY)
-    shown = max(first.attempt.curvature_shows(first.chosen, q) for q in first.chosen if q.name in FAMILY)
+    shown = max(first.problem.curvature_shows(first.chosen, q) for q in first.chosen if q.name in FAMILY)
     if shown < MIN_CURVATURE_NATS:
         return [first]
     first = at(DELAY, first.values)
@@ -185,10 +185,10 @@ def _described(attempt, attempted, effects, *, rest, clocks):
         for sensor, delay in delays.items():
             own = [delay - FIRST_SHARE * abs(delay), FIRST_SHARE * abs(delay)] if len(kind) == 2 else [delay]
             values |= {effects[lag_name(sensor, ending)].param_names()[0]: value for ending, value in zip(kind, own)}
-        told = at(kind, values)
+        hypothesis = at(kind, values)
         for _ in range(DELAY_LINEARISATIONS - 1 if len(kind) > 1 else 0):
-            told = at(kind, told.values)
-        found.append(told)
+            hypothesis = at(kind, hypothesis.values)
+        found.append(hypothesis)
     return found
 
 
@@ -200,12 +200,12 @@ def _silence(described, judges):
 
 def _explanations(described, judges, names):
     """Return every Explanation that the descriptions of each sensor make together, and that is better than none."""
-    options = {sensor: [_none(described[0], judges, sensor), *(_option(told, judges, sensor) for told in described)] for sensor in SENSORS}
+    options = {sensor: [_none(described[0], judges, sensor), *(_option(each, judges, sensor) for each in described)] for sensor in SENSORS}
     if len(described) == 1:   # without curvature the kinds are one column
         for some in options.values():
             some += [replace(some[1], kind=(ending,), alike=True) for ending in ('bandwidth', 'filter')]
-    found = [told for one, two in product(*options.values()) if one.kind or two.kind for told in _told_together(one, two, names)]
-    return [told for told in found if told.cost < sum(none.cost for none, *_ in options.values())]
+    found = [each for one, two in product(*options.values()) if one.kind or two.kind for each in _described_together(one, two, names)]
+    return [each for each in found if each.cost < sum(none.cost for none, *_ in options.values())]
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,26 +229,27 @@ class _Option:
         return self.lags + self.covariance[:, 0] / self.covariance[0, 0] * (delay - self.lags[0])
 
 
-def _option(told, judges, sensor):
-    return _Option(sensor, told.kind, _cost(told, told.chosen, judges, sensor) + PENALTY * len(told.kind), *told.lags(sensor), told.values)
+def _option(hypothesis, judges, sensor):
+    cost = _cost(hypothesis, hypothesis.chosen, judges, sensor) + PENALTY * len(hypothesis.kind)
+    return _Option(sensor, hypothesis.kind, cost, *hypothesis.lags(sensor), hypothesis.values)
 
 
-def _none(told, judges, sensor):
-    left = told.without(sensor)
-    values = dict(zip(told.attempt.space.names, told.attempt.values(left)))
-    return _Option(sensor, (), _cost(told, left, judges, sensor), np.zeros(0), np.zeros((0, 0)), values)
+def _none(hypothesis, judges, sensor):
+    left = hypothesis.without(sensor)
+    values = dict(zip(hypothesis.problem.space.names, hypothesis.problem.values(left)))
+    return _Option(sensor, (), _cost(hypothesis, left, judges, sensor), np.zeros(0), np.zeros((0, 0)), values)
 
 
-def _cost(told, chosen, judges, sensor):
-    """Return the held-out cost of one sensor's windows, nats, judged with the noise and the band of each attempt in turn."""
-    used, losses = told.attempt.search.used(chosen), []
+def _cost(hypothesis, chosen, judges, sensor):
+    """Return the held-out cost of one sensor's windows, nats, judged with the noise and the band of each linearisation in turn."""
+    used, losses = hypothesis.problem.search.indices(chosen), []
     for judge in judges:
-        space = replace(told.attempt.evidence.space, slow_only=judge.space.slow_only, slow_variance=judge.space.slow_variance)
-        losses.append(WindowEvidence(space, judge.noise, told.attempt.evidence.fold).heldout_parts(used)[sensor].sum())
+        space = replace(hypothesis.problem.evidence.space, slow_only=judge.space.slow_only, slow_variance=judge.space.slow_variance)
+        losses.append(WindowEvidence(space, judge.noise, hypothesis.problem.evidence.fold).heldout_parts(used)[sensor].sum())
     return 0.5 * float(np.mean(losses))
 
 
-def _told_together(one, two, names):
+def _described_together(one, two, names):
     """Yield the explanations of two sensors' lags: separate lags, or a common clock and the additional lags of each."""
     values = {name: (two if name.startswith(two.sensor) else one).values[name] for name in names}
     cost = one.cost + two.cost
@@ -270,17 +271,17 @@ def _told_together(one, two, names):
             yield Explanation({CLOCK: shared} | beside, cost - PENALTY + 0.5 * apart**2 / float(variances.sum()), values)
 
 
-def _rivals(settled, told, near):
+def _rivals(settled, selected, near):
     """Return the alternatives to a member of an explanation that fit nearly as well: members of explanations with no more effects."""
     asked, found = {question.name: question for question in settled.questions}, {}
     for other in sorted(near, key=lambda explanation: explanation.cost):
-        gone, come = sorted(set(told.lags) - set(other.lags)), sorted(set(other.lags) - set(told.lags))
-        if len(other.lags) > len(told.lags) or not gone:
+        gone, come = sorted(set(selected.lags) - set(other.lags)), sorted(set(other.lags) - set(selected.lags))
+        if len(other.lags) > len(selected.lags) or not gone:
             continue
-        moves = {name: other.values[name] - told.values[name] for name in told.values}
+        moves = {name: other.values[name] - selected.values[name] for name in selected.values}
         for name in come:
             place = next((each for each in gone if asked[each].sensor == asked[name].sensor), CLOCK if CLOCK in gone else gone[0])
             if name not in found:
                 first = place not in {rival.question.name for rival in found.values()}
-                found[name] = Rival(asked[place], asked[name], other.cost - told.cost, moves if first else {})
+                found[name] = Rival(asked[place], asked[name], other.cost - selected.cost, moves if first else {})
     return list(found.values())

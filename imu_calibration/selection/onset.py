@@ -8,9 +8,9 @@ import numpy as np
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.explained_share import MIN_EXPLAINED_SHARE, SIGNIFICANT_REST, ExplainedWindows
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.parameter_space import matrix_of_each
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_blocks import residuals
@@ -56,7 +56,7 @@ class Onset:
                                for name, value in self.before.items()}}
 
 
-def find_onset(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Question], *, windows: Sequence[Window],
+def find_onset(problem: LinearisedProblem, explained: ExplainedWindows, chosen: Sequence[Question], *, windows: Sequence[Window],
                table: Table) -> Onset | None:
     """
     Return the Onset that explains the residual of a choice, None without one.
@@ -66,7 +66,7 @@ def find_onset(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Q
     linear change of the same parameters with time. The moment is then refined to the sample at which the residuals of both states are
     least.
     """
-    used, space, groups = attempt.search.used(chosen), attempt.evidence.space, _groups(attempt.recording.model)
+    used, space, groups = problem.search.indices(chosen), problem.evidence.space, _groups(problem.recording.model)
     every = np.array(list(dict.fromkeys([*used, *(k for group in groups.values() for k in group)])))
     small, time = space.restricted(every), space.recording.time - space.recording.time.mean()
     each = matrix_of_each(small, explained.floor.noise)
@@ -93,10 +93,10 @@ def find_onset(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Q
         return None
     most = SIMPLER * max(min(excess for _, excess, *_ in found), noise)
     _, excess, name, ends, group, own, (values, change, sd) = min(entry for entry in found if entry[1] <= most)
-    full, changed = np.zeros(attempt.space.size), np.zeros(attempt.space.size)
+    full, changed = np.zeros(problem.space.size), np.zeros(problem.space.size)
     full[own], changed[group] = values, change
-    states = [attempt.absolute(full), attempt.absolute(full) + changed]
-    model, names = attempt.recording.model, [attempt.space.names[k] for k in group]
+    states = [problem.absolute(full), problem.absolute(full) + changed]
+    model, names = problem.recording.model, [problem.space.names[k] for k in group]
     units = {label: effect.unit_of(k) for effect in model.effects for k, label in enumerate(effect.param_names())}
     moment, moment_sd = _refined(windows, table, model, states=states, between=space.recording.time[ends])
     before, after = (dict(zip(names, state[group].tolist())) for state in states)

@@ -8,9 +8,9 @@ from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.effects.base import AXES, PREFIXES, SENSORS, Effect
 from imu_calibration.effects.catalogue import term
 from imu_calibration.estimation.observability import MOTIONS, TABLE_MOTIONS
-from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import MIN_SMOOTH_SHARE
 from imu_calibration.selection.formulas import Formula, FormulaChoice, FormulaSearch, grammar
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.residual_blocks import RestBlocks
 from imu_calibration.selection.residual_fit import BlockFit, BlockFits, share_interval, share_removed
 
@@ -97,15 +97,15 @@ class Proposal:
                 'confirming_motion': self.motion, 'sentence': self.sentence}
 
 
-def propose(blocks: RestBlocks, attempt: Attempt, fits: BlockFits) -> Proposal | None:
+def propose(blocks: RestBlocks, problem: LinearisedProblem, fits: BlockFits) -> Proposal | None:
     """
     Return a Proposal for the residual of a sensor with the chosen effects, or None where no formula removes most of it.
 
     Formulas are chosen on the selection windows, with all plausible contributions of the catalogue projected out; the share is
     from the locked windows with the findings in the model, and both halves of the selection windows must agree.
     """
-    search = FormulaSearch(blocks, _grammar(blocks), _plausible(blocks.sensor, attempt),
-                           reference_temperature=attempt.recording.model.temperature_ref_c)
+    search = FormulaSearch(blocks, _grammar(blocks), _plausible(blocks.sensor, problem),
+                           reference_temperature=problem.recording.model.temperature_ref_c)
     plain = fits.fit()
     if plain.excess <= 0:
         return None
@@ -123,21 +123,21 @@ def propose(blocks: RestBlocks, attempt: Attempt, fits: BlockFits) -> Proposal |
     needed = MIN_SMOOTH_SHARE if any(choice.formula.smooth for choice in choices) else MIN_FORMULA_SHARE
     if not choices or share < needed:
         return None
-    return _told(blocks, attempt, fits, plain, choices)
+    return _told(blocks, problem, fits, plain, choices)
 
 
-def _plausible(sensor, attempt):
+def _plausible(sensor, problem):
     """
     Return a factor of the covariance that the catalogue's parameters may have, shape (q, q).
 
     A cause in the table acts on both sensors: its explained share here is limited by its estimate there.
     """
-    plausible = np.diag(attempt.space.prior_sd)
+    plausible = np.diag(problem.space.prior_sd)
     other = next(each for each in SENSORS if each != sensor)
-    for question in attempt.questions:
+    for question in problem.questions:
         if question.sensor not in SENSORS and other in question.effect.acts_on and len(question.effect.acts_on) > 1:
             own = list(question.parameters)
-            known = attempt.evidence.known_from(other, [*attempt.search.baseline, *own])[-len(own):, -len(own):]
+            known = problem.evidence.known_from(other, [*problem.search.baseline, *own])[-len(own):, -len(own):]
             plausible[np.ix_(own, own)] = OTHER_SENSOR * np.linalg.cholesky(known)
     return plausible
 
@@ -160,12 +160,12 @@ def _stable(fits, choices):
     return bool((apart**2).mean() < 9.0 or (apart**2).sum() < 0.1 * (strength**2).sum())
 
 
-def _told(blocks, attempt, fits, plain, choices):
+def _told(blocks, problem, fits, plain, choices):
     terms = [entry for choice in choices for entry in _shapes(fits, choices, choice)][:MOST_TERMS]
     columns = np.concatenate([column for column, _, _ in terms], axis=1)
     after = fits.fit(columns)
     share = share_removed(plain, after)
-    effects = tuple(_effect(blocks.sensor, number, text, formula, after.amplitudes[number], _taken(attempt))
+    effects = tuple(_effect(blocks.sensor, number, text, formula, after.amplitudes[number], _taken(problem))
                     for number, (_, text, formula) in enumerate(terms))
     seen = np.abs(after.amplitudes) > CONCERNED_SDS * after.sd
     rms = np.sqrt((columns**2).mean(axis=0))
@@ -175,7 +175,7 @@ def _told(blocks, attempt, fits, plain, choices):
         blocks.sensor, effects, tuple(after.amplitudes), tuple(after.sd), frozenset().union(*(formula.family for _, _, formula in terms)),
         axes,
         share, share_interval(plain, after, np.random.default_rng(1)), 1.0 - float(np.sqrt(max(1.0 - share, 0.0))), choices[0].p_value,
-        tuple(_shown(formula) for formula in choices[0].alike[:SHOWN_ALIKE]), _nearest(fits, plain, attempt), _motion(effects),
+        tuple(_shown(formula) for formula in choices[0].alike[:SHOWN_ALIKE]), _nearest(fits, plain, problem), _motion(effects),
         tuple(float(np.sqrt((rms[k]**2 * amplitude**2).sum())) for k, amplitude in enumerate(after.amplitudes)))
 
 
@@ -210,8 +210,8 @@ def _summed(columns, weights):
     return ' + '.join(f'{weight:g} * {column}' if weight != 1.0 else column for column, weight in zip(columns, weights) if weight)
 
 
-def _taken(attempt):
-    return {name for _, name in attempt.baseline.catalogue.effects(attempt.baseline.joint_names)}
+def _taken(problem):
+    return {name for _, name in problem.baseline.catalogue.effects(problem.baseline.joint_names)}
 
 
 def _effect(sensor, number, text, formula, values, taken):
@@ -252,10 +252,10 @@ def _motion(effects):
     return '; '.join(dict.fromkeys(texts[name] for effect in effects for name in effect.motion[:1] if name in texts))
 
 
-def _nearest(fits: BlockFits, plain: BlockFit, attempt: Attempt) -> tuple[str, float] | None:
+def _nearest(fits: BlockFits, plain: BlockFit, problem: LinearisedProblem) -> tuple[str, float] | None:
     """Return (effect, share removed) of the best fit in the catalogue."""
     best: tuple[str, float] | None = None
-    for question in attempt.questions:
+    for question in problem.questions:
         if set(question.parameters) <= fits.used or not any(np.isin(question.parameters, index).any() for index in fits.blocks.index):
             continue
         share = share_removed(plain, fits.fit(more=question.parameters))

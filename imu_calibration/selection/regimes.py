@@ -8,7 +8,7 @@ import numpy as np
 
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES
-from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.regime_variables import FEWEST, Variable, variables_of
 from imu_calibration.selection.residual_blocks import BlockWhitener, RestBlocks
 
@@ -73,15 +73,15 @@ class RestRegime:
                 'size': self.size, 'bounds': None if self.bounds is None else list(self.bounds)}
 
 
-def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, joint_names: Sequence[str], axes: Sequence[str] = AXES,
-                 formula: np.ndarray | None = None) -> list[RestRegime]:
+def find_regimes(blocks: RestBlocks, problem: LinearisedProblem, used: Sequence[int], *, joint_names: Sequence[str],
+                 axes: Sequence[str] = AXES, formula: np.ndarray | None = None) -> list[RestRegime]:
     """
     Return the regimes of a sensor's axes, the likeliest of each axis first.
 
     Parameters
     ----------
     blocks : RestBlocks
-    attempt : Attempt
+    problem : LinearisedProblem
     used : sequence of int
         Parameters of the model.
     joint_names : sequence of str
@@ -91,7 +91,7 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
         Columns of a formula for the residual, which a regime must exceed.
 
     """
-    exchange = exchanges(blocks.window, attempt.recording.kind[blocks.window], np.linalg.norm(blocks.means(blocks.ref.rate_s), axis=1))
+    exchange = exchanges(blocks.window, problem.recording.kind[blocks.window], np.linalg.norm(blocks.means(blocks.ref.rate_s), axis=1))
     search, level = RegimeSearch(blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange), REGIME_LEVEL / len(AXES)
     white, found = None, []
     for axis, name in enumerate(AXES):
@@ -100,7 +100,7 @@ def find_regimes(blocks: RestBlocks, attempt: Attempt, used: Sequence[int], *, j
             white = white or BlockWhitener(blocks, np.ones(len(blocks.time), bool))
             at = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
             own, scaled = blocks.index[axis][at], partial(white, axis=axis)
-            prior = 1 / attempt.space.prior_sd[own]**2, attempt.space.prior_mean[own]
+            prior = 1 / problem.space.prior_sd[own]**2, problem.space.prior_mean[own]
             rest = AxisResidual(scaled(blocks.design[axis][:, [*at, -1]]), *prior)
             offsets = search.offsets(name, rest, scaled, level=level / 2, formula=None if formula is None else formula[:, :, axis])
         found += offsets or search.scatters(name, blocks.rough[:, axis], blocks.freedom, level=level / 2)

@@ -28,7 +28,7 @@ NOT_NEEDED = 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Examination(Investigation):
+class ResidualAnalysis(Investigation):
     """An Investigation with the residual analysis of each sensor, evaluated lazily and cached."""
 
     table: Table
@@ -37,24 +37,24 @@ class Examination(Investigation):
     _proposals: dict = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
-    def of(cls, found: Investigation, table: Table) -> 'Examination':
-        """Return an Investigation as an Examination; an Examination is returned unchanged."""
+    def of(cls, found: Investigation, table: Table) -> 'ResidualAnalysis':
+        """Return an Investigation as an ResidualAnalysis; an ResidualAnalysis is returned unchanged."""
         return found if isinstance(found, cls) else cls(**{each.name: getattr(found, each.name) for each in fields(found)}, table=table)
 
     @cached_property
     def rests(self) -> dict[str, Unexplained]:
         """Sensor -> Unexplained, with the axes that carry it where it is significant."""
-        found = unexplained(self.attempt, self.explained, self.named)
+        found = unexplained(self.problem, self.explained, self.named)
         return {sensor: replace(rest, axes=self.fits(sensor).axes()) if rest.significant else rest for sensor, rest in found.items()}
 
     @cached_property
     def blocks(self) -> dict[str, RestBlocks]:
         """Sensor -> RestBlocks."""
-        return rest_blocks(self.used, self.table, self.attempt, explained=self.explained)
+        return rest_blocks(self.used, self.table, self.problem, explained=self.explained)
 
     def fits(self, sensor: str, chosen: Sequence[Question] | None = None) -> BlockFits:
         """Return the fits of a choice, of the findings where not given, to the blocks of a sensor."""
-        space, used = self.attempt.space, tuple(self.search.used(self.named if chosen is None else chosen))
+        space, used = self.problem.space, tuple(self.search.indices(self.named if chosen is None else chosen))
         if (sensor, used) not in self._fits:
             self._fits[sensor, used] = BlockFits(self.blocks[sensor], used, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
         return self._fits[sensor, used]
@@ -62,7 +62,7 @@ class Examination(Investigation):
     def regimes(self, sensor: str, chosen: Sequence[Question] | None = None, formula: np.ndarray | None = None) -> list[RestRegime]:
         """Return the regimes of a sensor's residual with a choice in the model, the findings where not given (`find_regimes`)."""
         fits, offsets = self.fits(sensor, chosen), chosen is not None or self.rests[sensor].significant or formula is not None
-        return find_regimes(self.blocks[sensor], self.attempt, sorted(fits.used), joint_names=self.table.joint_names,
+        return find_regimes(self.blocks[sensor], self.problem, sorted(fits.used), joint_names=self.table.joint_names,
                             axes=fits.axes() if offsets else (), formula=formula)
 
     def proposal(self, sensor: str) -> Proposal | None:
@@ -74,7 +74,7 @@ class Examination(Investigation):
         if sensor not in self._proposals:
             fits = self.fits(sensor)
             clear = self.rests[sensor].significant or fits.sigma > MIN_FORMULA_SDS
-            self._proposals[sensor] = propose(self.blocks[sensor], self.attempt, fits) if clear else None
+            self._proposals[sensor] = propose(self.blocks[sensor], self.problem, fits) if clear else None
         return self._proposals[sensor]
 
     def columns(self, sensor: str, proposal: Proposal | None) -> np.ndarray | None:
@@ -83,7 +83,7 @@ class Examination(Investigation):
             return None
         blocks = self.blocks[sensor]
         groups = [group for effect in proposal.effects for group in effect.groups]
-        known = {'temperature_ref_c': self.attempt.recording.model.temperature_ref_c}
+        known = {'temperature_ref_c': self.problem.recording.model.temperature_ref_c}
         means = [blocks.means(group.columns(blocks.ref, known)) for group in groups]
         return np.stack([np.broadcast_to(mean, (len(mean), 3)) for mean in means], axis=1)
 
@@ -99,7 +99,7 @@ class Examination(Investigation):
         regimes = self.regimes(sensor, formula=self.columns(sensor, proposal))
         first = {regime.axis: regime for regime in reversed(regimes)}
         if not rest.significant and proposal is None and not first:
-            return beyond_noise(self.attempt, sensor, rest)
+            return beyond_noise(self.problem, sensor, rest)
         axes = rest.axes or (self.fits(sensor).axes() if proposal is not None else tuple(first))
         found = replace(rest, regimes=tuple(first[axis] for axis in axes if axis in first), proposal=proposal,
                         axes=axes if proposal is None else proposal.axes)
@@ -115,16 +115,16 @@ class Examination(Investigation):
         self._fits.clear()
         return found
 
-    def without(self, gone: Sequence[Question]) -> 'Examination':
-        """Return the Examination without some findings; they remain doubtful, and widen the uncertainty of all other ones."""
+    def without(self, gone: Sequence[Question]) -> 'ResidualAnalysis':
+        """Return the ResidualAnalysis without some findings; they remain doubtful, and widen the uncertainty of all other ones."""
         names = {question.name for question in gone}
-        other = replace(self, named=[question for question in self.named if question not in gone], doubtful=[*self.doubtful, *gone],
+        other = replace(self, named=[question for question in self.named if question not in gone], rejected=[*self.rejected, *gone],
                         rivals=[rival for rival in self.rivals if rival.question.name not in names])
         other.__dict__['blocks'] = self.blocks
         return other
 
 
-def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, bias_processes: dict | None = None) -> Examination:
+def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, bias_processes: dict | None = None) -> ResidualAnalysis:
     """
     Test every effect that a model lacks (`investigate`), and withdraw findings that a formula or a regime replaces.
 
@@ -139,17 +139,17 @@ def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, bias
         As `investigate`.
 
     """
-    return without_superseded(Examination.of(investigate(windows, table, model, bias_processes=bias_processes), table))
+    return without_superseded(ResidualAnalysis.of(investigate(windows, table, model, bias_processes=bias_processes), table))
 
 
-def without_superseded(found: Examination) -> Examination:
-    """Return the Examination without findings that a formula or a place does without."""
+def without_superseded(found: ResidualAnalysis) -> ResidualAnalysis:
+    """Return the ResidualAnalysis without findings that a formula or a place does without."""
     while found.named and (gone := superseded(found)):
         found = found.without(gone)
     return found
 
 
-def superseded(found: Examination) -> list[Question]:
+def superseded(found: ResidualAnalysis) -> list[Question]:
     """
     Return the findings that a formula or a regime replaces: they approximated the part that correlates with them.
 
@@ -173,7 +173,7 @@ def _done_without(found, question):
     kept, left_out = ({sensor: found.fits(sensor, some) for sensor in sensors} for some in (found.named, others))
     alone = {sensor: left_out[sensor].fit().excess - kept[sensor].fit().excess for sensor in sensors}
     for stand_in in (lambda sensor: found.columns(sensor, found.proposal(sensor)),
-                     lambda sensor: found.columns(sensor, propose(found.blocks[sensor], found.attempt, left_out[sensor])),
+                     lambda sensor: found.columns(sensor, propose(found.blocks[sensor], found.problem, left_out[sensor])),
                      lambda sensor: _places(found, sensor, others)):
         beside = dict(alone)
         for sensor in asked:

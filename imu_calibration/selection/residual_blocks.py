@@ -15,8 +15,8 @@ from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, chunks
-from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import ExplainedWindows
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.noise_beside_effects import natural_processes
 from imu_calibration.selection.questions import TEMPERATURE_SPAN
 from imu_calibration.selection.saturation import measured
@@ -99,16 +99,17 @@ class BlockWhitener:
         return white if axis is None else white / self.scale[axis]
 
 
-def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, explained: ExplainedWindows) -> dict[str, RestBlocks]:
+def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProblem, *,
+                explained: ExplainedWindows) -> dict[str, RestBlocks]:
     """
-    Return sensor -> RestBlocks of the windows that an attempt reduced.
+    Return sensor -> RestBlocks of the windows of the reduced recording.
 
     Parameters
     ----------
     windows : sequence of Window
         Windows of the fit, in order.
     table : Table
-    attempt : Attempt
+    problem : LinearisedProblem
         The linearisation of the columns.
     explained : ExplainedWindows
         Expected loss from noise.
@@ -127,20 +128,20 @@ def rest_blocks(windows: Sequence[Window], table: Table, attempt: Attempt, *, ex
     count = np.concatenate([part.count for part in parts])
     common = {'starts': np.cumsum(np.append(0, per_block[:-1])),
               'time': np.concatenate([part.means(w.time) for w, part in zip(windows, parts)]),
-              'window': number, 'locked': attempt.locked[number]}
-    references = References(attempt.recording.model, table, motion, temperature_c=temperature)
-    columns_of = _block_means(attempt, table, motion, temperature, common['starts'])
+              'window': number, 'locked': problem.locked[number]}
+    references = References(problem.recording.model, table, motion, temperature_c=temperature)
+    columns_of = _block_means(problem, table, motion, temperature, common['starts'])
     found, edges = {}, np.concatenate([part.edges[:-1] + first for part, first in zip(parts, np.cumsum([0, *map(len, windows[:-1])]))])
-    for sensor, residual in residuals(windows, table, attempt.recording.model, values=attempt.recording.values).items():
+    for sensor, residual in residuals(windows, table, problem.recording.model, values=problem.recording.values).items():
         mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
         floor = explained.floor.noise[sensor]
-        busier = _busier(windows, sensor, floor, attempt.recording.kind[which], ~attempt.locked[which])
+        busier = _busier(windows, sensor, floor, problem.recording.kind[which], ~problem.locked[which])
         variance = floor.low_variance * busier[place] / count[:, None]
         # An estimated bias process would absorb a step or a warm-up; regimes are searched with the least bias processes.
-        processes = natural_processes(floor, attempt.recording.period)
+        processes = natural_processes(floor, problem.recording.period)
         rows = np.concatenate([columns_of[sensor], mean], axis=1)
-        design = tuple(rows @ join for join in attempt.space.join[sensor])
-        found[sensor] = RestBlocks(sensor, references.at(sensor), **common, design=design, index=tuple(attempt.space.index[sensor]),
+        design = tuple(rows @ join for join in problem.space.join[sensor])
+        found[sensor] = RestBlocks(sensor, references.at(sensor), **common, design=design, index=tuple(problem.space.index[sensor]),
                                    variance=variance, processes=processes,
                                    **_roughness(residual, windows, edges, least=LEAST_NOISE[sensor]))
     return found
@@ -189,9 +190,9 @@ def residuals(windows: Sequence[Window], table: Table, model: SensorModel, *, va
             for sensor in SENSORS}
 
 
-def _block_means(attempt, table, motion, temperature, starts):
+def _block_means(problem, table, motion, temperature, starts):
     """Return sensor -> means of all columns over the blocks, shape (b, p): some blocks at a time, as their columns need much memory."""
-    recording, found, edges = attempt.recording, {sensor: [] for sensor in SENSORS}, np.append(starts, len(motion))
+    recording, found, edges = problem.recording, {sensor: [] for sensor in SENSORS}, np.append(starts, len(motion))
     for first in range(0, len(starts), AT_A_TIME):
         own = edges[first:first + AT_A_TIME + 1]
         rows = slice(own[0], own[-1])

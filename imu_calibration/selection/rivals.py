@@ -10,10 +10,10 @@ import numpy as np
 import scipy.linalg
 
 from imu_calibration.estimation.scaled_solve import JITTER
-from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.explained_share import Explained, needed_share, sensors_of
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import PENALTY, TIE, Search
 
@@ -40,9 +40,9 @@ class Rival:
         return float(1.0 / (1.0 + np.exp(min(self.behind, 700.0))))
 
 
-def settle_rivals(attempt: Attempt, chosen: Sequence[Question], attempted: Callable) -> tuple[Attempt, list[Rival]]:
+def settle_rivals(problem: LinearisedProblem, chosen: Sequence[Question], linearised_at: Callable) -> tuple[LinearisedProblem, list[Rival]]:
     """
-    Return (the Attempt at the best of a choice and its rivals, the rivals close to it).
+    Return (the LinearisedProblem at the best of a choice and its rivals, the rivals close to it).
 
     The first derivatives of a delay and of a low-pass are the same, and a search that is linearised at one of them represents its rival by
     its tangent only: the first one would win. So each is linearised at its own estimate, and all are compared with the same noise,
@@ -50,18 +50,18 @@ def settle_rivals(attempt: Attempt, chosen: Sequence[Question], attempted: Calla
 
     Parameters
     ----------
-    attempt : Attempt
+    problem : LinearisedProblem
         Linearised where none of them acts.
     chosen : sequence of Question
-    attempted : callable
-        ``attempted(point=..., effects=...)``: the Attempt elsewhere, or with some of the effects.
+    linearised_at : callable
+        ``linearised_at(point=..., effects=...)``: the LinearisedProblem elsewhere, or with some of the effects.
 
     """
     chosen = [question for question in chosen if '@' not in question.label]
-    choices = [chosen, *_swapped(attempt, chosen)]
+    choices = [chosen, *_swapped(problem, chosen)]
     if len(choices) == 1:
-        return attempt, []
-    few = partial(attempted, effects=list({question.name: question.effect for choice in choices for question in choice}.values()))
+        return problem, []
+    few = partial(linearised_at, effects=list({question.name: question.effect for choice in choices for question in choice}.values()))
     start = few()
     attempts = [few(point=start.point(same_questions(start, choice))) for choice in choices]
     choices = [same_questions(there, choice) for there, choice in zip(attempts, choices)]
@@ -69,29 +69,29 @@ def settle_rivals(attempt: Attempt, chosen: Sequence[Question], attempted: Calla
     best = int(np.argmin(costs))
     values = [dict(zip(there.space.names, there.values(choice))) for there, choice in zip(attempts, choices)]
     near = [k for k in range(len(choices)) if k != best and costs[k] - costs[best] < TIE]
-    settled, found = attempted(point=attempt.point(same_questions(attempt, choices[best]))), []
+    settled, found = linearised_at(point=problem.point(same_questions(problem, choices[best]))), []
     for k in near:
         taken, other = same_questions(settled, _difference(choices[best], choices[k]))
-        moves = {name: values[k][name] - values[best][name] for name in attempt.baseline.param_names}
+        moves = {name: values[k][name] - values[best][name] for name in problem.baseline.param_names}
         found.append(Rival(taken, other, float(costs[k] - costs[best]), moves))
     return settled, found
 
 
-def same_questions(attempt: Attempt, chosen: Sequence[Question]) -> list[Question]:
-    """Return the same questions in another attempt: a warm-up at the likeliest time constant of its bank."""
+def same_questions(problem: LinearisedProblem, chosen: Sequence[Question]) -> list[Question]:
+    """Return the same questions at another linearisation: a warm-up at the likeliest time constant of its bank."""
     found = []
     for each in chosen:
-        asked = [question for question in attempt.questions if question.name == each.name]
+        asked = [question for question in problem.questions if question.name == each.name]
         same = [question for question in asked if question.label == each.label]
-        found.append((same or [min(asked, key=lambda question: attempt.evidence.loss(attempt.search.used([question])))])[0])
+        found.append((same or [min(asked, key=lambda question: problem.evidence.loss(problem.search.indices([question])))])[0])
     return found
 
 
-def _swapped(attempt, chosen):
+def _swapped(problem, chosen):
     """Return the choices with an effect replaced by one that only curvature separates from it, where the curvature is observable."""
     return [[other if each is question else each for each in chosen] for question in chosen
-            if question.effect.warp is not None and attempt.curvature_shows(chosen, question) > MIN_CURVATURE_NATS
-            for other, _ in attempt.search.class_mates(chosen, question, most=None) if other.effect.warp is not None]
+            if question.effect.warp is not None and problem.curvature_shows(chosen, question) > MIN_CURVATURE_NATS
+            for other, _ in problem.search.confounded(chosen, question, most=None) if other.effect.warp is not None]
 
 
 def _difference(one, two):
@@ -99,18 +99,18 @@ def _difference(one, two):
     return next(pair for pair in zip(one, two) if pair[0].name != pair[1].name)
 
 
-def _cost(attempt, chosen, judge):
+def _cost(problem, chosen, judge):
     """Return the held-out cost of a choice at its own linearisation, judged with the noise and the band of another attempt."""
-    space = replace(attempt.evidence.space, slow_only=judge.space.slow_only, slow_variance=judge.space.slow_variance)
-    evidence = WindowEvidence(space, judge.noise, attempt.evidence.fold)
-    return 0.5 * evidence.heldout(attempt.search.used(chosen)) + PENALTY * sum(question.penalty for question in chosen)
+    space = replace(problem.evidence.space, slow_only=judge.space.slow_only, slow_variance=judge.space.slow_variance)
+    evidence = WindowEvidence(space, judge.noise, problem.evidence.fold)
+    return 0.5 * evidence.heldout(problem.search.indices(chosen)) + PENALTY * sum(question.penalty for question in chosen)
 
 
 AS_MUCH = 0.5
 """Share of the held-out likelihood of an effect that a simpler one must reach to be tested as its replacement."""
 
 
-def simpler(attempt: Attempt, explained: Explained, named: Sequence[Question]) -> Sequence[Question]:
+def simpler(problem: LinearisedProblem, explained: Explained, named: Sequence[Question]) -> Sequence[Question]:
     """
     Return findings with no more parameters than the held-out residual supports.
 
@@ -122,10 +122,10 @@ def simpler(attempt: Attempt, explained: Explained, named: Sequence[Question]) -
     for place, question in enumerate(named):
         if not explained.rest_beside(kept, question):
             continue
-        for other in _fewer(attempt.search, kept, question):
+        for other in _fewer(problem.search, kept, question):
             instead = [*kept[:place], other, *kept[place + 1:]]
-            if (attempt.search.allowed(instead, other) and explained.share(instead, other) >= needed_share(other)
-                    and gain_in_turn(attempt, instead, kept, sensors=sensors_of(question.effect)).ci95[0] <= LEAST_REDUCTION):
+            if (problem.search.allowed(instead, other) and explained.share(instead, other) >= needed_share(other)
+                    and gain_in_turn(problem, instead, kept, sensors=sensors_of(question.effect)).ci95[0] <= LEAST_REDUCTION):
                 kept = instead
                 break
     return kept

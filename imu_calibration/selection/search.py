@@ -87,7 +87,7 @@ class Search:
         self.encoder_step, self.any_size, self.resolved = encoder_step, any_size, resolved
         self.history = []
 
-    def used(self, chosen: Sequence[Question]) -> tuple[int, ...]:
+    def indices(self, chosen: Sequence[Question]) -> tuple[int, ...]:
         """Return the parameters of the baseline and of the chosen effects."""
         return self.baseline + tuple(k for q in chosen for k in q.parameters)
 
@@ -98,13 +98,13 @@ class Search:
 
     def cost(self, chosen: Sequence[Question], most: float = np.inf) -> float:
         """Return the held-out cost of a choice, nats, penalties included; above `most` without the penalty for implausible sizes."""
-        cost = 0.5 * self.evidence.heldout(self.used(chosen)) + PENALTY * sum(q.penalty for q in chosen)
+        cost = 0.5 * self.evidence.heldout(self.indices(chosen)) + PENALTY * sum(q.penalty for q in chosen)
         return cost if cost > most else cost + IMPLAUSIBLE * sum(self.implausible(chosen, q) for q in chosen)
 
     def score(self, chosen: Sequence[Question], question: Question) -> Score:
         """Return the Score of one more effect."""
         beside = [*chosen, question]
-        smaller, larger = self.used(chosen), self.used(beside)
+        smaller, larger = self.indices(chosen), self.indices(beside)
         gain = 0.5 * (self.evidence.heldout(smaller) - self.evidence.heldout(larger))
         p_value = min(1.0, self.evidence.p_value(smaller, larger) * len(self.questions))
         asked = p_value < FAMILY_WISE and gain > 0
@@ -138,7 +138,7 @@ class Search:
 
     def estimate(self, chosen: Sequence[Question], question: Question) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, standard deviations) of the parameters of a chosen effect."""
-        used = self.used(chosen)
+        used = self.indices(chosen)
         values, covariance = self.evidence.fit(used)
         places = [used.index(k) for k in question.parameters]
         return values[places], np.sqrt(np.diag(covariance)[places])
@@ -146,7 +146,7 @@ class Search:
     def moved_by(self, chosen: Sequence[Question], question: Question, names: Sequence[str]) -> dict[str, float]:
         """Return parameter -> its change, of the baseline and of the other choices among `names`, when an effect joins them."""
         others = [q for q in chosen if q is not question]
-        smaller, larger = self.used(others), self.used([*others, question])
+        smaller, larger = self.indices(others), self.indices([*others, question])
         moved = self.evidence.fit(larger)[0][:len(smaller)] - self.evidence.fit(smaller)[0]
         return {names[k]: float(change) for k, change in zip(smaller, moved) if k < len(names)}
 
@@ -159,7 +159,7 @@ class Search:
         if question.sensor in SENSORS or len(question.effect.acts_on) < 2:
             return True
         rest = [q for q in chosen if q is not question]
-        before, after = (self.evidence.heldout_parts(self.used(some)) for some in (rest, chosen))
+        before, after = (self.evidence.heldout_parts(self.indices(some)) for some in (rest, chosen))
         return all((after[sensor] - before[sensor]).sum() < 2 * MIN_GAIN_NATS for sensor in question.effect.acts_on)
 
     def run(self, start: Sequence[Question] = ()) -> Sequence[Question]:
@@ -214,13 +214,13 @@ class Search:
                     best, cost = trial, value
         return best
 
-    def standing(self, chosen: Sequence[Question]) -> Sequence[Question]:
+    def drop_insignificant(self, chosen: Sequence[Question]) -> Sequence[Question]:
         """Return the effects of a choice that are still significant after removals: of a clock and a lag that cancel, none."""
         while (smaller := self._dropped(chosen)) is not None:
             chosen = smaller
         return chosen
 
-    def class_mates(self, chosen: Sequence[Question], question: Question, *,
+    def confounded(self, chosen: Sequence[Question], question: Question, *,
                     most: int | None = CLASS_SIZE - 1) -> list[tuple[Question, float]]:
         """Return (question, difference in nats) of effects that would do as well in the place of `question`, best first, at most `most`."""
         place, cost = chosen.index(question), self.cost(chosen)
@@ -249,8 +249,8 @@ def least_angle(effect: Effect, encoder_step: float) -> float:
     return 0.5 * encoder_step / angles[effect.unit] if effect.unit in angles else 0.0
 
 
-class Named(ABC):
-    """Findings of a search, separated by plausibility of their sizes."""
+class SelectedEffects(ABC):
+    """PoseScan of a search, separated by plausibility of their sizes."""
 
     named: Sequence[Question]
 
@@ -261,11 +261,11 @@ class Named(ABC):
 
     @property
     def implausible(self) -> list[Question]:
-        """Findings with sizes above those of any known instrument: reported, but added to a model only on request."""
+        """PoseScan with sizes above those of any known instrument: reported, but added to a model only on request."""
         return [question for question in self.named if self.search.implausible(self.named, question)]
 
     @property
     def adopted(self) -> list[Question]:
-        """Findings that belong into the model."""
+        """PoseScan that belong into the model."""
         strange = self.implausible
         return [question for question in self.named if question not in strange]

@@ -201,8 +201,8 @@ def find_tones(found: Investigation, table: Table, formulas: Sequence[Proposal] 
     second. Where few stretches turn, integer orders are searched in all motions of the joint (`orders_of`). Fixed frequencies are
     removed before multiples of a speed are searched.
     """
-    model = found.attempt.recording.model
-    values = found.attempt.values(found.named)[:len(model.param_names)]
+    model = found.problem.recording.model
+    values = found.problem.values(found.named)[:len(model.param_names)]
     for formula in formulas:
         for effect, size in zip(formula.effects, formula.values):
             known = replace(model, catalogue=model.catalogue.with_effects(effect))
@@ -226,8 +226,8 @@ def find_tones(found: Investigation, table: Table, formulas: Sequence[Proposal] 
 
 def _significant(tones, tests):
     """Return (axis, joint) -> the most significant tone, its p-value times the number of tests and axes."""
-    told, first = [replace(tone, p_value=tone.p_value * len(AXES) * tests) for tone in tones], {}
-    for tone in sorted((tone for tone in told if tone.p_value < TONE_P_VALUE), key=lambda tone: tone.p_value):
+    corrected, first = [replace(tone, p_value=tone.p_value * len(AXES) * tests) for tone in tones], {}
+    for tone in sorted((tone for tone in corrected if tone.p_value < TONE_P_VALUE), key=lambda tone: tone.p_value):
         first.setdefault((tone.axis, tone.joint), tone)
     return first
 

@@ -9,8 +9,8 @@ import numpy as np
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.explained_share import ExplainedWindows
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_fit import largest_axes
 
@@ -66,16 +66,16 @@ class Unexplained:
         return {'rms': self.rms, 'axes': list(self.axes)} | ({'unit': self.unit} if self.unit else {})
 
 
-def unexplained(attempt: Attempt, explained: ExplainedWindows, chosen: Sequence[Question]) -> dict[str, Unexplained]:
+def unexplained(problem: LinearisedProblem, explained: ExplainedWindows, chosen: Sequence[Question]) -> dict[str, Unexplained]:
     """Return sensor -> Unexplained for a choice of effects."""
-    excess, used = explained.excess(chosen), attempt.search.used(chosen)
-    values = attempt.space.reduced(used, attempt.evidence.fit(used)[0])
-    return {sensor: _rest(attempt, explained, sensor, excess[sensor], values) for sensor in SENSORS}
+    excess, used = explained.excess(chosen), problem.search.indices(chosen)
+    values = problem.space.reduced(used, problem.evidence.fit(used)[0])
+    return {sensor: _rest(problem, explained, sensor, excess[sensor], values) for sensor in SENSORS}
 
 
-def beyond_noise(attempt: Attempt, sensor: str, rest: Unexplained) -> Unexplained:
+def beyond_noise(problem: LinearisedProblem, sensor: str, rest: Unexplained) -> Unexplained:
     """Return the residual of a sensor, as significant if loud tones or the scatter in motion of one axis exceed the noise at rest."""
-    scatter, noise = _scatter_of_one_axis(attempt, sensor), attempt.noise[sensor].white_variance
+    scatter, noise = _scatter_of_one_axis(problem, sensor), problem.noise[sensor].white_variance
     squares = np.array(scatter)
     for tone in rest.tones:
         axis, mean_square = AXES.index(tone.axis), 0.5 * tone.amplitude**2
@@ -87,13 +87,13 @@ def beyond_noise(attempt: Attempt, sensor: str, rest: Unexplained) -> Unexplaine
                    correlates_with=IN_MOTION if scatter.any() else None)
 
 
-def _scatter_of_one_axis(attempt: Attempt, sensor: str) -> np.ndarray:
+def _scatter_of_one_axis(problem: LinearisedProblem, sensor: str) -> np.ndarray:
     """
     Return the excess variance of moving samples over the noise at rest of an axis that exceeds the others, shape (3,); otherwise 0.
 
     Errors of the reference (encoder steps, jitter of the stamps) scatter all axes in motion, a cause in the sensor its own axis.
     """
-    noise, recording = attempt.noise[sensor].at_rest_only(), attempt.recording
+    noise, recording = problem.noise[sensor].at_rest_only(), problem.recording
     kinds, counts = recording.kind[recording.moving], recording.count[recording.moving]
     if not len(kinds):
         return np.zeros(3)
@@ -117,8 +117,8 @@ def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dic
     return found
 
 
-def _rest(attempt, explained, sensor, excess, values):
-    space, recording = attempt.space, attempt.recording
+def _rest(problem, explained, sensor, excess, values):
+    space, recording = problem.space, problem.recording
     residual = np.stack([space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1)
     floor = explained.floor.noise[sensor]
     white = floor.variance_beside_bias(recording.kind, recording.count, recording.duration, keys=recording.keys)

@@ -17,14 +17,14 @@ from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_options import hand_options
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.references.turntable.gathered import Gathered
+from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.use_cases.recordings import Source, Topics, open_bag, source_of
 from msg_adapters.bag import Recording, list_topics
 from msg_adapters.imu import IMU_TYPE
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class RecordingSummary:
     """Properties of one Imu topic of a recording, with the joints and temperatures used with it."""
 
     recording: Recording
@@ -70,7 +70,7 @@ def _by_frame(bag, topics):
     return [topics._replace(frame=frame) for frame in frames] if len(frames) > 1 else [topics]
 
 
-def inspect(bag: str | PathLike, topics: Iterable[Topics], table: Table | None, *, options: CalibrationOptions) -> list[Look]:
+def inspect(bag: str | PathLike, topics: Iterable[Topics], table: Table | None, *, options: CalibrationOptions) -> list[RecordingSummary]:
     """Inspect each Imu topic of a recording, with the joints and temperatures used with it."""
     return [_look(bag, each, table, options) for each in topics]
 
@@ -88,7 +88,7 @@ def _look(bag, topics, table, options):
     if not preflight.streams:   # not read to its end: no data to calibrate from
         preflight = Preflight(table and table.gravity_value, strict=False)
         by_hand = _by_hand(source_of(bag, topics, want_joints='optional', want_temperature='optional'), options, preflight)
-    look = Look(recording, preflight.streams, preflight.findings, preflight.lost, calibrated, by_hand)
+    look = RecordingSummary(recording, preflight.streams, preflight.findings, preflight.lost, calibrated, by_hand)
     return look if table is None and not look.refused else replace(look, by_hand=None)
 
 
@@ -105,7 +105,7 @@ def _by_hand(source, options, preflight):
         return error
 
 
-def _watched_by(preflight: Preflight) -> Callable[[GatherStep, Iterable[tuple[int, Source]]], Iterable[Gathered]]:
+def _watched_by(preflight: Preflight) -> Callable[[GatherStep, Iterable[tuple[int, Source]]], Iterable[SessionData]]:
     """Return the map step of one recording that shows it to the checks, when it is read for the first time."""
     def mapper(step, numbered):
         if preflight.streams:

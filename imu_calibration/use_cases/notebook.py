@@ -32,12 +32,12 @@ def _for_notebooks(function: Callable[Arguments, Result]) -> Callable[Arguments,
     hints = {name: f'argument {name}' for name in (names | set(Choices.__annotations__) if 'choices' in names else names)}
 
     @wraps(function)
-    def told(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+    def with_hints(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
         try:
             return function(*arguments, **named)
         except ImuCalibrationError as error:
-            raise type(error)(error.told(hints), code=error.code) from None
-    return told
+            raise type(error)(error.with_hint(hints), code=error.code) from None
+    return with_hints
 
 
 @_for_notebooks

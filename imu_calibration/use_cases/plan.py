@@ -25,7 +25,7 @@ from imu_calibration.kinematics.motion_limits import NOT_CHECKED, limit_words, l
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.campaign import make_separator
 from imu_calibration.planning.planner import Plan, make_planner, plan_by_hand, plan_to_mapping, trajectory_to_mapping
-from imu_calibration.planning.situation import expected_noise
+from imu_calibration.planning.planning_problem import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import calibration_options
@@ -97,7 +97,7 @@ class Planned:
         files.write_text(place / 'plan.yaml', text)
 
     def _messages(self):
-        from imu_calibration.planning.repertoire import trajectory
+        from imu_calibration.planning.motion_library import trajectory
         names, begins = tuple(self.plan.model.joint_names), np.concatenate([[0.0], self.plan.ends[:-1]])
         return [(PLAN_START_NS + round(float(begin) * 1e9), trajectory(names, segments))
                 for begin, segments in zip(begins, self.plan.segments, strict=True) if segments]

@@ -11,17 +11,17 @@ import imu_calibration as imu
 from imu_calibration.calibration import by_evidence
 from imu_calibration.calibration.by_evidence import _moves, extended_solution, stands_out
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
-from imu_calibration.calibration.diagnosis.table_diagnosis import told
-from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
+from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.gathered import SpreadWindows
+from imu_calibration.references.turntable.session_data import DecimatedWindows
 from imu_calibration.report.diagnosis_page import diagnosis_report
 from imu_calibration.selection import investigation, questions
-from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.investigation import investigate
-from imu_calibration.selection.residual_analysis import Examination
+from imu_calibration.selection.linearised_problem import LinearisedProblem
+from imu_calibration.selection.residual_analysis import ResidualAnalysis
 from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
 from imu_calibration.selection.unexplained import Unexplained, biases_off
 
@@ -92,12 +92,12 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
             made.append(replace(window, force_s=outputs[0], rate_s=outputs[1]))
         return made
     bare = SensorModel(accelerometer=('bias', 'matrix'), joint_names=NAMES)
-    whole, half = (Examination.of(investigate(measured(share), TABLE, bare), TABLE) for share in (0.0, 0.5))
-    assert [question.name for question in whole.named] == ['gyro_g_sensitivity'] and not whole.denied
+    whole, half = (ResidualAnalysis.of(investigate(measured(share), TABLE, bare), TABLE) for share in (0.0, 0.5))
+    assert [question.name for question in whole.named] == ['gyro_g_sensitivity'] and not whole.unstable
     assert not half.named
-    question = next(question for question in half.attempt.questions if question.name == 'gyro_g_sensitivity')
-    assert not half.attempt.agrees_in_halves([question], question) and half.attempt.search.score([], question).significant
-    added = _disagreement(replace(half, denied=[question]), bare.param_names)
+    question = next(question for question in half.problem.questions if question.name == 'gyro_g_sensitivity')
+    assert not half.problem.agrees_in_halves([question], question) and half.problem.search.score([], question).significant
+    added = _disagreement(replace(half, unstable=[question]), bare.param_names)
     assert np.all(np.linalg.eigvalsh(added) > -1e-18) and np.sqrt(np.diag(added)[bare.slices['gyroscope', 'bias']]).max() > 1e-4
     assert not _disagreement(whole, bare.param_names).any()
 
@@ -105,11 +105,11 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
 def test_windows_for_the_search_are_spread_and_bounded():
     """Of a long session every so many-th window of each kind is kept, moving ones and rests alike; of a short one all."""
     windows = calibrated(make_pair(None, 11).first).windows
-    every = SpreadWindows()
+    every = DecimatedWindows()
     for window in windows:
         every.add(window)
     assert [w.time[0] for w in every.windows] == [w.time[0] for w in windows]
-    some = SpreadWindows(4000)
+    some = DecimatedWindows(4000)
     for window in windows:
         some.add(window)
     assert some.n_samples == sum(len(w.time) for w in some.windows) <= 4000
@@ -123,26 +123,26 @@ def test_a_delay_and_a_lag_are_judged_where_each_is_as_large_as_it_is(late):
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
     used = [window for window in windows if window.kind != 'unused']
     effects = questions.without_saturation(questions.testable_effects(model, table, used)[0])
-    attempted = partial(Attempt, used, table, model, effects=effects, locked=np.zeros(len(used), bool))
-    first = attempted()
+    linearised_at = partial(LinearisedProblem, used, table, model, effects=effects, locked=np.zeros(len(used), bool))
+    first = linearised_at()
     by_name = {question.name: question for question in first.questions}
     for start in ('time_offset', 'gyro_bandwidth'):
-        settled, near = settle_rivals(first, [by_name[start]], attempted)
+        settled, near = settle_rivals(first, [by_name[start]], linearised_at)
         assert settled.search.run()[0].name == 'time_offset' and not near
-    lag = attempted(point=first.point([by_name['gyro_bandwidth']]))
+    lag = linearised_at(point=first.point([by_name['gyro_bandwidth']]))
     assert lag.values(same_questions(lag, [by_name['gyro_bandwidth']]))[lag.space.names.index('gyroscope.gyro_bandwidth.time_constant')] > 0.01
-    assert settle_rivals(first, [by_name['gyro_quadratic']], attempted) == (first, [])
+    assert settle_rivals(first, [by_name['gyro_quadratic']], linearised_at) == (first, [])
 
 
 def _disagreement(found, names):
     """What an investigation adds to the covariance."""
-    return Demand(moves=_moves(found)).disagreement(names)
+    return ModelExtension(moves=_moves(found)).disagreement(names)
 
 
 def investigated(late):
     """Return what the search finds in the session beyond biases and matrices."""
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(late[1].joint_names))
-    return Examination.of(investigate(calibrated(late[0]).windows, late[1], model), late[1])
+    return ResidualAnalysis.of(investigate(calibrated(late[0]).windows, late[1], model), late[1])
 
 
 @pytest.fixture(scope='module')
@@ -152,39 +152,39 @@ def examined(late):
 
 def test_a_rival_widens_by_its_weight_and_is_named_beside_the_finding(late, examined):
     found = examined
-    names = found.attempt.baseline.param_names
+    names = found.problem.baseline.param_names
     question = found.named[0]
     rivals = [Rival(question, question, behind, {names[0]: 0.3}) for behind in (0.0, 800.0)]
-    added = [_disagreement(replace(found, denied=[], doubtful=[], rivals=[rival]), names)[0, 0] for rival in rivals]
+    added = [_disagreement(replace(found, unstable=[], rejected=[], rivals=[rival]), names)[0, 0] for rival in rivals]
     assert added[0] == pytest.approx(0.5 * 0.3**2) and added[1] < 1e-200
-    beside = replace(found, rivals=[replace(rivals[0], other=found.attempt.questions[0])])
-    mates = told(late[1], beside).findings[0].indistinguishable_from
-    assert mates[0] == found.attempt.questions[0].name
+    beside = replace(found, rivals=[replace(rivals[0], other=found.problem.questions[0])])
+    mates = build_diagnosis(late[1], beside).findings[0].indistinguishable_from
+    assert mates[0] == found.problem.questions[0].name
 
 
 @pytest.mark.long
 def test_what_likelihood_asks_for_and_nobody_is_sure_of_is_not_named_but_widens(late, monkeypatch):
     monkeypatch.setattr(investigation, '_that_help', lambda *_: [])
     found = investigated(late)
-    assert not found.named and 'time_offset' in [question.name for question in found.doubtful]
-    names = found.attempt.baseline.param_names
+    assert not found.named and 'time_offset' in [question.name for question in found.rejected]
+    names = found.problem.baseline.param_names
     added = _disagreement(found, names)
     assert np.sqrt(added[names.index('gyroscope.matrix.xx'), names.index('gyroscope.matrix.xx')]) > 3e-3
-    assert not _disagreement(replace(found, doubtful=[]), names)[names.index('gyroscope.matrix.xx')].any()
+    assert not _disagreement(replace(found, rejected=[]), names)[names.index('gyroscope.matrix.xx')].any()
 
 
 def test_a_finding_of_the_model_as_asked_must_stand_out_too(examined, monkeypatch):
     found = examined
-    solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.named)
+    solution = extended_solution(found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.named)
     assert by_evidence._without_faint(found, solution) is found
     monkeypatch.setattr(by_evidence, 'stands_out', lambda solution, question: question is not found.named[0])
     less = by_evidence._without_faint(found, solution)
-    assert found.named[0] not in less.named and list(less.denied) == [*found.denied, found.named[0]]
+    assert found.named[0] not in less.named and list(less.unstable) == [*found.unstable, found.named[0]]
 
 
 def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_is_left_out(late, asked, examined, monkeypatch):
     found = examined
-    solution = extended_solution(found.attempt.space, found.attempt.noise, found.attempt.baseline, chosen=found.named)
+    solution = extended_solution(found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.named)
     question = found.named[0]
     assert stands_out(solution, question) and not stands_out(replace(solution, terms={'noise': 1e9 * solution.covariance}), question)
     part = solution.model.slices[question.sensor, question.name]

@@ -45,7 +45,7 @@ def seek(effect, sizes):
 
 
 def test_nothing_is_found_where_nothing_is_hidden(sizes):
-    search = sizes.attempt.search
+    search = sizes.problem.search
     assert search.run() == []
     assert [s.question.label for s in search.history[0] if s.significant] == []
 
@@ -77,7 +77,7 @@ def test_cause_outside_the_catalogue_is_unexplained_and_not_named():
 
 def test_earlier_choice_is_replaced_by_the_simpler_effect_that_does_as_well(sizes):
     recording = record(SEED, {'lever_arm': sizes.hidden('lever_arm', SEED, 5.0)}, 'white', through_bag=False, **QUICK)
-    search = investigate(recording.windows, recording.table, recording.model).attempt.search
+    search = investigate(recording.windows, recording.table, recording.model).problem.search
     nine_arms = next(q for q in search.questions if q.name == 'accel_size_effect')
     assert [q.name for q in search.reconsidered([nine_arms])] == ['lever_arm']
 
@@ -118,12 +118,12 @@ def test_what_locked_windows_show_moves_the_gain_and_nothing_else(sizes):
     windows = [replace(w, force_s=w.force_s + 10 * w.noise_sd[0], rate_s=w.rate_s + 10 * w.noise_sd[1]) if w in struck else w for w in used]
     found, other = (investigate(some, recording.table, recording.model) for some in (used, windows))
     assert [q.label for q in found.named] == [q.label for q in other.named] == ['accel_quadratic']
-    assert [[s.gain for s in scores] for scores in found.attempt.search.history] == [[s.gain for s in scores] for scores in other.attempt.search.history]
-    for one, two in zip(found.attempt.evidence.fit(found.attempt.search.used(found.named)), other.attempt.evidence.fit(other.attempt.search.used(other.named))):
+    assert [[s.gain for s in scores] for scores in found.problem.search.history] == [[s.gain for s in scores] for scores in other.problem.search.history]
+    for one, two in zip(found.problem.evidence.fit(found.problem.search.indices(found.named)), other.problem.evidence.fit(other.problem.search.indices(other.named))):
         np.testing.assert_array_equal(one, two)
-    for sensor, noise in found.attempt.noise.items():
-        assert noise_figures(noise) == noise_figures(other.attempt.noise[sensor])
-    gains = [heldout_gain(each.attempt, [], each.named, sensors=['accelerometer']) for each in (found, other)]
+    for sensor, noise in found.problem.noise.items():
+        assert noise_figures(noise) == noise_figures(other.problem.noise[sensor])
+    gains = [heldout_gain(each.problem, [], each.named, sensors=['accelerometer']) for each in (found, other)]
     assert gains[0].heldout_rms_after < 0.9 * gains[1].heldout_rms_after
 
 
@@ -156,8 +156,8 @@ def test_too_few_windows_are_refused(empty):
 
 
 def test_falls_of_the_loss_are_chi_square_where_nothing_is_hidden(sizes):
-    search = sizes.attempt.search
-    falls = np.array([[search.evidence.loss(search.used([])) - search.evidence.loss(search.used([q])), len(q.parameters)]
+    search = sizes.problem.search
+    falls = np.array([[search.evidence.loss(search.indices([])) - search.evidence.loss(search.indices([q])), len(q.parameters)]
                       for q in search.questions if '@' not in q.label])
     # 25 effects, partly dependent: their sum stays near its expectation
     assert 1e-3 < chi2.sf(falls[:, 0].sum(), falls[:, 1].sum()) < 1 - 1e-3
@@ -168,17 +168,17 @@ def test_the_gain_is_that_of_corrected_readings(sizes):
     recording, diagnosis = seek('accel_quadratic', sizes)
     found, rms = inquire(recording.windows, recording.table, recording.model), []
     for chosen in ([], found.named):
-        known = dict(zip(found.attempt.space.names, found.attempt.values(chosen)))
+        known = dict(zip(found.problem.space.names, found.problem.values(chosen)))
         model = recording.model.with_effect('accelerometer', 'accel_quadratic') if chosen else recording.model
         values = np.array([known[name] for name in model.param_names])
         calibration = Calibration(model, values, np.zeros((len(values),) * 2), ('determined',) * len(values))
         means = []
-        for window in (window for window, locked in zip(found.used, found.attempt.locked) if locked):
+        for window in (window for window, locked in zip(found.used, found.problem.locked) if locked):
             ref = reference_motion(recording.table, window.motion)
             alpha = np.broadcast_to(ref.alpha_s, (len(window), 3))
             means.append((compensate(calibration, window.force_s, window.rate_s, alpha_s=alpha).force - ref.force_s).mean(axis=0))
         rms.append(np.sqrt(np.mean(np.square(means))))
-    gain, of_model = diagnosis.findings[0].gain, heldout_gain(found.attempt, [], found.named, sensors=['accelerometer'])
+    gain, of_model = diagnosis.findings[0].gain, heldout_gain(found.problem, [], found.named, sensors=['accelerometer'])
     assert (gain.of, gain.measure, of_model.measure) == (APPLIED, 'window means', 'window means')
     assert 1 - gain.reduction == pytest.approx(rms[1] / rms[0], rel=1e-9)
     assert 1 - of_model.reduction != pytest.approx(rms[1] / rms[0], rel=1e-5)

@@ -21,7 +21,7 @@ from imu_calibration.references.gravity import pose_residuals
 from imu_calibration.references.gravity.effect_rows import build_rows
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions
-from imu_calibration.references.gravity.model_selection import Inquiry, investigate_by_hand
+from imu_calibration.references.gravity.model_selection import HandProblem, investigate_by_hand
 from imu_calibration.selection import regimes
 from imu_calibration.selection.gain import APPLIED, OF_MODEL
 from imu_calibration.simulation.profiles import make_profile
@@ -110,7 +110,7 @@ def test_what_held_parameters_may_be_is_no_finding(monkeypatch):
     table = Table.from_mapping(profile.table)
     model = SensorModel(joint_names=table.joint_names)
     imu = simulate_session(model, random_values(model), table, profile=profile)[0]
-    monkeypatch.setattr(Inquiry, 'named', lambda self: [])   # what is asked about is known before the search
+    monkeypatch.setattr(HandProblem, 'named', lambda self: [])   # what is asked about is known before the search
     found = investigate_by_hand(gather_by_hand(imu), HandOptions(GRAVITY))
     assert {'gyro_rate_product', 'gyro_quadratic'} <= {entry['effect'] for entry in found.not_testable}
 

@@ -10,7 +10,7 @@ from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND, question
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.references.turntable.gathered import MAX_LIVE_SAMPLES
+from imu_calibration.references.turntable.session_data import MAX_LIVE_SAMPLES
 
 from worlds.live_sessions import TABLE, TOLERANCES, make_session
 

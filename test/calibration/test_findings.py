@@ -32,14 +32,14 @@ class Search:
         size = {FIRST: 90.0, SECOND: 60.0, MATE: 50.0, OTHER: 1.0}[question] / (1 + len(chosen))
         return Score(question, size, np.exp(-size), True)
 
-    def class_mates(self, chosen, question):
+    def confounded(self, chosen, question):
         return {FIRST: [(MATE, 3.0)], SECOND: [(MATE, 1.0), (OTHER, 7.0)]}[question]
 
-    def used(self, chosen):
+    def indices(self, chosen):
         return tuple(k for question in chosen for k in question.parameters)
 
     def estimate(self, chosen, question):
-        return 10.0 * np.array(question.parameters) + sum(self.used(chosen)), np.ones(len(question.parameters))
+        return 10.0 * np.array(question.parameters) + sum(self.indices(chosen)), np.ones(len(question.parameters))
 
 
 @pytest.fixture(scope='module')
@@ -92,13 +92,13 @@ def test_what_explains_much_but_leaves_most_is_said():
     from imu_calibration.calibration.diagnosis.diagnosis_result import Candidate
     from imu_calibration.calibration.diagnosis.diagnosis_workflow import nothing_named
 
-    class Told:
+    class LagHypothesis:
         candidates = (Candidate('time_offset', 'reference', 4321.0, 0.0, 4321.0, 0.0, LEAVES_MOST),)
-    assert all(word in nothing_named(Told) for word in ('time_offset', '4321 nats'))
-    Told.candidates = (Candidate('gyro_delay', 'gyroscope', 163.0, 0.0, 163.0, 0.0, DISAGREED),)
-    assert all(word in nothing_named(Told) for word in ('gyro_delay', '163 nats'))
-    Told.candidates = (Candidate('time_offset', 'reference', 12.0, 1e-4, 12.0, 1e-4, LEAVES_MOST),)
-    assert 'time_offset' not in nothing_named(Told)
+    assert all(word in nothing_named(LagHypothesis) for word in ('time_offset', '4321 nats'))
+    LagHypothesis.candidates = (Candidate('gyro_delay', 'gyroscope', 163.0, 0.0, 163.0, 0.0, DISAGREED),)
+    assert all(word in nothing_named(LagHypothesis) for word in ('gyro_delay', '163 nats'))
+    LagHypothesis.candidates = (Candidate('time_offset', 'reference', 12.0, 1e-4, 12.0, 1e-4, LEAVES_MOST),)
+    assert 'time_offset' not in nothing_named(LagHypothesis)
 
 
 class LagsAndDelay(forward.Evidence):

@@ -10,7 +10,7 @@ from test_live_calibration import assert_same, blocks
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.diagnosis.live_diagnosis import Answer, describe, question_about
-from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.session import LiveSettings
 from imu_calibration.core.errors import DocumentError
@@ -81,7 +81,7 @@ def test_the_answer_is_that_of_the_verb(station, expected):
 
 def test_what_is_found_joins_the_model_and_the_live_result_is_that_of_calibrate(station, expected):
     live = station.live
-    assert live.adopt(station.answer.demand)
+    assert live.adopt(station.answer.extension)
     found = live.solve(pending=True).calibration
     assert 'accel_quadratic' in found.statistics['added'] and not {'added', 'denied'} & set(station.before.statistics)
     assert found.statistics['added'] == expected.calibration.statistics['added']
@@ -90,8 +90,8 @@ def test_what_is_found_joins_the_model_and_the_live_result_is_that_of_calibrate(
         assert found.proof[sensor]['after'] == pytest.approx(entry['after'], rel=1e-9)
     assert sum('accel_quadratic (' in line for line in found.notes) == 1
     again = station.question().answer()   # about a session whose model is wide already
-    assert again.demand.added == station.answer.demand.added
-    assert live.adopt(again.demand)
+    assert again.extension.added == station.answer.extension.added
+    assert live.adopt(again.extension)
     assert_same(live.solve(pending=True).calibration, expected.calibration)
 
 
@@ -102,12 +102,12 @@ def test_windows_after_the_adoption_count_like_those_before(hidden, expected):
     for block in every[:3 * len(every) // 4]:
         live.push(block)
     live.solve(pending=True)
-    assert live.adopt(question_about(live).answer().demand)
+    assert live.adopt(question_about(live).answer().extension)
     for block in every[3 * len(every) // 4:]:
         live.push(block)
     named = {key for key, part in live.solve(pending=True).model.slices.items()}
     assert ('accelerometer', 'accel_quadratic') in named
-    live.adopt(question_about(live).answer().demand)
+    live.adopt(question_about(live).answer().extension)
     assert_same(live.solve(pending=True).calibration, expected.calibration)
 
 
@@ -119,7 +119,7 @@ def test_a_delay_is_taken_at_its_size_like_offline():
     for block in blocks(pair.first.imu, pair.first.joints):
         live.push(block)
     live.solve(pending=True)
-    assert live.adopt(question_about(live).answer().demand)
+    assert live.adopt(question_about(live).answer().extension)
     expected = calibrate_by_evidence([lambda: iter([pair.first.block])], table).result.calibration
     found = live.solve(pending=True).calibration
     assert 'time_offset' in found.statistics['added']
@@ -132,7 +132,7 @@ def test_the_model_as_asked_stays(hidden):
         live.push(block)
     before = live.solve(pending=True).calibration
     answer = question_about(live).answer()
-    assert answer.state.word == 'found' and not live.adopt(answer.demand)   # it is said, and that is all
+    assert answer.state.word == 'found' and not live.adopt(answer.extension)   # it is said, and that is all
     after = live.solve(pending=True).calibration
     assert after.param_names == before.param_names and 'added' not in after.statistics
     np.testing.assert_array_equal(after.sd, before.sd)
@@ -142,8 +142,8 @@ def test_what_cannot_join_is_said_and_widens(hidden):
     """The store was too small for the motion: calibrate the recording offline."""
     station = Station(hidden, store_samples=500)
     before, answer = station.live.result.calibration, station.question().answer()
-    assert answer.demand.changes.lacking == ('accel_quadratic',) and not answer.demand.added
-    assert station.live.adopt(answer.demand)
+    assert answer.extension.changes.lacking == ('accel_quadratic',) and not answer.extension.added
+    assert station.live.adopt(answer.extension)
     after = station.live.solve(pending=True).calibration
     assert after.param_names == before.param_names and (after.sd >= before.sd).all() and np.max(after.sd / before.sd) > 1.5
     lines = [line for line in after.notes if 'accel_quadratic' in line or 'offline' in line]
@@ -152,12 +152,12 @@ def test_what_cannot_join_is_said_and_widens(hidden):
 
 def test_a_resumed_session_keeps_what_joined(station, hidden):
     """Saved with the wide model, the session goes on with it, and stays with it: the columns of before cannot be taken anew."""
-    station.live.adopt(station.answer.demand)
+    station.live.adopt(station.answer.extension)
     station.live.solve(pending=True)
     saved = station.live.saved(pending=True)
     table = Table.from_mapping(hidden.table)
     resumed = LiveCalibration(table, saved=saved)
-    assert resumed.demand.added == station.live.demand.added and resumed.model.has_columns_of(station.live.model)
+    assert resumed.extension.added == station.live.extension.added and resumed.model.has_columns_of(station.live.model)
     assert_same(resumed.solve().calibration, station.live.solve(pending=True).calibration)
     assert resumed.result.calibration.statistics['added'] == station.live.result.calibration.statistics['added']
     assert question_about(resumed) is None   # the windows of before have no samples any more
@@ -168,7 +168,7 @@ def test_a_resumed_session_keeps_what_joined(station, hidden):
         resumed.push(block)
     resumed.solve(pending=True)
     answer = question_about(resumed).answer()
-    assert answer.demand.added == station.live.demand.added and not answer.demand.changes.lacking
+    assert answer.extension.added == station.live.extension.added and not answer.extension.changes.lacking
     with refused(DocumentError, 'other_model', 'accel_quadratic'):
         LiveCalibration(table, CalibrationOptions(as_asked=True), saved=saved)
 
@@ -177,7 +177,7 @@ def test_nothing_is_found_where_nothing_is_hidden():
     station = Station(physics.make_session(3, **QUICK))
     before, answer = station.live.result.calibration, station.question().answer()
     assert answer.state.word == 'nothing found'
-    assert answer.demand.is_nothing and not station.live.adopt(answer.demand)
+    assert answer.extension.is_nothing and not station.live.adopt(answer.extension)
     np.testing.assert_array_equal(station.live.solve(pending=True).calibration.sd, before.sd)
 
 
@@ -206,7 +206,7 @@ class Slow:
         """Wait, look whether to go on, answer."""
         while not self.go.wait(0.01):
             report('waiting', 0.5, 1.0)
-        return Answer(LiveState('found', self.words), Demand())
+        return Answer(LiveState('found', self.words), ModelExtension())
 
     @property
     def samples(self):
@@ -263,7 +263,7 @@ def test_who_saves_waits_for_the_answer_and_asks_the_same_once():
     thread, question = DiagnosisThread(3600.0), Slow('first')
     threading.Timer(0.2, question.go.set).start()
     thread.settle(question)
-    assert thread.n_answers == 1 and thread.take_demand() is not None and thread.take_demand() is None
+    assert thread.n_answers == 1 and thread.take_extension() is not None and thread.take_extension() is None
     thread.settle(question)
     thread.settle(None)
     assert thread.n_answers == 1

@@ -14,7 +14,7 @@ from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import Regime, moving_pieces
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.gathered import TABLE_FOLDS, HeldOut
+from imu_calibration.references.turntable.session_data import TABLE_FOLDS, HeldOut
 from imu_calibration.use_cases.calibrate import calibrate
 
 from worlds.misfit_worlds import make_pair

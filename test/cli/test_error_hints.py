@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.pose_scan import Findings, hand_status
+from imu_calibration.calibration.pose_scan import PoseScan, hand_status
 from imu_calibration.cli.main import main
 from imu_calibration.cli.parser import VERBS, hints_of, make_parser
 from imu_calibration.core.errors import ERROR_KEYS, InputError, with_hint
@@ -125,9 +125,9 @@ def test_a_second_remedy_is_offered_only_where_it_exists():
     with pytest.raises(InputError) as refusal:
         check_force(1.0)
     error = refusal.value
-    assert 'nominal scaling (--nominal)' in error.told({'nominal': '--nominal'})
+    assert 'nominal scaling (--nominal)' in error.with_hint({'nominal': '--nominal'})
     for node in HINTS:
-        assert 'nominal' not in error.told(HINTS[node]) and error.told(HINTS[node]).endswith('convert it in the driver')
+        assert 'nominal' not in error.with_hint(HINTS[node]) and error.with_hint(HINTS[node]).endswith('convert it in the driver')
     assert with_hint('find the cause', 'diagnose', HINTS['calibration_node']).startswith('call ~/diagnose')
     assert with_hint('find the cause', 'diagnose', {}) == "run 'imu_calibration diagnose' to find the cause"
     assert 'consent' in with_hint('calibrate again', 'anyway', HINTS['compensator_node']) > with_hint('calibrate again', 'anyway', {})
@@ -154,6 +154,6 @@ def test_the_command_line_says_its_option(capsys, tmp_path):
 def test_the_live_session_by_hand_says_the_parameter_of_its_node():
     class Solved:
         status_by_name, undetermined = {COMMON_SCALE: 'weak'}, ()
-    found = Findings([slice(0, 9)] * 9, None, 9, 8, {}, 0.0)
+    found = PoseScan([slice(0, 9)] * 9, None, 9, 8, {}, 0.0)
     assert hand_status(found, Solved, step='', hints=HINTS['calibration_node']).message.endswith(
         "next: give the local gravity, which scales the accelerometer as a whole (parameter 'gravity')")

@@ -20,7 +20,7 @@ from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.comparison import compare
-from imu_calibration.document.exports.affine import holding_of, lower_times_rotation, upper_times_rotation
+from imu_calibration.document.exports.affine import capability_of, lower_times_rotation, upper_times_rotation
 from imu_calibration.document.exports.export import UNITS, all_targets, export, find_reader, find_target, loss_lines, rendered
 from imu_calibration.document.exports.loss import ROUNDING_LOSS, import_file, motion_of, standard_motion
 from imu_calibration.document.exports.target import Readings
@@ -76,12 +76,12 @@ def held_by(name, seed, **fields):
     """Return a random calibration with those effects alone that a target holds, biases gone where it estimates them."""
     target = find_target(name)
     model = random_calibration(seed, FURTHER['accelerometer'], FURTHER['gyroscope']).model
-    kept = {sensor: tuple(e.name for e in model.effects if e.sensor == sensor and holding_of(e,
+    kept = {sensor: tuple(e.name for e in model.effects if e.sensor == sensor and capability_of(e,
                                                                                              target.holds) and e.role not in (Role.OFFSET,
                                                                                                                               Role.LINEAR))
             for sensor in SENSORS}
     found = random_calibration(seed, kept['accelerometer'], kept['gyroscope'], **fields)
-    return with_values(found, OFFSET=None) if holding_of(found.model.effects[0], target.estimates) else found
+    return with_values(found, OFFSET=None) if capability_of(found.model.effects[0], target.estimates) else found
 
 
 # Triangular times rotation
@@ -184,10 +184,10 @@ def bare(name, calibration):
     """Return a calibration whose matrices and biases a program can hold: of its own axis, or not at all."""
     target, values = find_target(name), calibration.values.copy()
     for effect in calibration.model.effects:
-        holding, part = holding_of(effect, target.holds), calibration.model.slices[effect.key]
-        if holding is None:
+        capability, part = capability_of(effect, target.holds), calibration.model.slices[effect.key]
+        if capability is None:
             values[part] = effect.prior_values()
-        elif holding.own_axis:
+        elif capability.own_axis:
             values[part] = np.diag(np.diag(values[part].reshape(3, 3))).ravel()
     return replace(calibration, values=values)
 
@@ -299,7 +299,7 @@ def test_what_is_left_is_what_was_announced(name, seed):
     found = export(calibration, target, motion=motion(seed))
     known = replace(calibration, values=calibration.values.copy())   # what the program estimates is known to it
     for effect in calibration.model.effects:
-        if holding_of(effect, target.estimates):
+        if capability_of(effect, target.estimates):
             known.values[calibration.model.slices[effect.key]] = effect.prior_values()
     warmth = (ref.temperature_c,) if name in THERMAL else ()
     made = applied(CORRECTING[name], found.content, *found.placement.readings(*readings(known, ref)), *warmth)
@@ -318,8 +318,8 @@ def test_every_effect_is_held_or_estimated_or_said_to_be_lost(name):
     found = export(calibration, target)
     told = {lost.effect.key for lost in found.loss.effects} | {effect.key for effect in found.loss.estimated}
     for effect in calibration.model.effects:
-        holding = holding_of(effect, target.holds)
-        assert (effect.key in told) == (holding is None or holding.own_axis or holding_of(effect, target.estimates) is not None), effect.key
+        capability = capability_of(effect, target.holds)
+        assert (effect.key in told) == (capability is None or capability.own_axis or capability_of(effect, target.estimates) is not None), effect.key
     text = found.content.decode()
     for lost in found.loss.effects:
         assert f'{lost.effect.sensor} {lost.effect.name}' in text   # in the file as well
@@ -387,13 +387,13 @@ def test_an_import_of_an_export_is_what_it_was(name, seed):
 
 
 def find_holding(target, role):
-    return any(holding.role is role for holding in target.holds)
+    return any(capability.role is role for capability in target.holds)
 
 
 def compare_values(found, calibration, target):
     for effect in found.model.effects:
         wanted = calibration.value(*effect.key) if effect.key in calibration.model.slices else effect.prior_values().reshape(effect.shape)
-        if holding_of(effect, target.estimates) is None:
+        if capability_of(effect, target.estimates) is None:
             np.testing.assert_allclose(found.value(*effect.key), wanted, rtol=0, atol=ROUND_TRIP, err_msg=str(effect.key))
 
 

@@ -13,7 +13,7 @@ from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowKind
-from imu_calibration.references.turntable.gathered import Gathered
+from imu_calibration.references.turntable.session_data import SessionData
 
 from worlds.misfit_coverage import calibrated
 from worlds.misfit_worlds import make_pair
@@ -91,7 +91,7 @@ def test_what_is_frequent_is_how_the_recording_is(session):
 def test_a_session_that_goes_on_leaves_out_the_same(session):
     """Nothing but the accumulator is needed: live, after a restart, with any number of windows."""
     total = accumulated(leaned(session.windows, numbers(session.windows, WindowKind.STATIC)[5:6]))
-    again = from_bytes(to_bytes(Gathered(total), MODEL), MODEL).accumulator
+    again = from_bytes(to_bytes(SessionData(total), MODEL), MODEL).accumulator
     first, second = solve(total, MODEL), solve(again, MODEL)
     assert first.noise['accelerometer'].left_out == second.noise['accelerometer'].left_out
     np.testing.assert_array_equal(first.values, second.values)

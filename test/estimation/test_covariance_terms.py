@@ -7,7 +7,7 @@ import pytest
 from refusal import refused
 
 import imu_calibration as imu
-from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.compensation.compensate import invertible_values
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text, from_mapping, to_mapping
@@ -104,6 +104,6 @@ def test_the_solution_without_clipped_samples_has_the_terms_of_the_search(by_tab
     """What other choices would have moved enters the covariance of that solution too."""
     solution = by_table.solution
     name = solution.param_names[0]
-    demand = Demand(moves=(({name: 0.5}, 1.0),), clipped=solution)
-    found = demand.applied(replace(solution, values=solution.values + 1.0))
+    extension = ModelExtension(moves=(({name: 0.5}, 1.0),), clipped=solution)
+    found = extension.applied(replace(solution, values=solution.values + 1.0))
     assert found.values[0] == solution.values[0] and found.terms[REJECTED][0, 0] == 0.25

@@ -10,11 +10,11 @@ from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import accumulator as accumulator_module
 from imu_calibration.estimation.accumulator import Accumulator, restrict
-from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, NO_BIAS, Waves, errors_of_waves
+from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, NO_BIAS, CosineScores, errors_of_waves
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.turntable.gathered import Gathered
+from imu_calibration.references.turntable.session_data import SessionData
 
 from worlds.misfit_coverage import base_sd, calibrated, errors_in_sd
 from worlds.misfit_worlds import make_pair
@@ -132,7 +132,7 @@ def test_copies_and_merged_systems_go_their_own_way(windows):
 def test_blocks_survive_a_restart(windows):
     """A session that goes on where it was saved has the same standard deviations."""
     total = accumulated(measured(windows, lambda share: 5e-3 * share, 1))
-    again = from_bytes(to_bytes(Gathered(total), MODEL), MODEL).accumulator
+    again = from_bytes(to_bytes(SessionData(total), MODEL), MODEL).accumulator
     first, second = solve(total, MODEL), solve(again, MODEL)
     assert np.any(grown(first) > 1.0)
     np.testing.assert_array_equal(first.sd, second.sd)
@@ -165,7 +165,7 @@ def test_a_drift_shows_beside_noise_that_was_taken_too_large():
         rng = np.random.default_rng(5)
         moved = fast * rng.choice([-1.0, 1.0], (12, 3))
         moved[0] = 1.7
-        return Waves(own, moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3))
+        return CosineScores(own, moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3))
 
     own = np.arange(len(SensorModel().param_names))[SensorModel().slices['gyroscope', 'bias']]
     assert np.all(errors_of_waves(waves(0.33), SensorModel())[0].drift_variance[own] > 1.0)
@@ -176,7 +176,7 @@ def test_parts_that_ask_for_more_than_noise_explains_widen_by_half_more_than_the
     """Twelve cosines, each of two sds: the excess of three variances counts 1.5 times."""
     moved = 2.0 * np.random.default_rng(6).choice([-1.0, 1.0], (12, 3))
     own = SensorModel().slices['gyroscope', 'bias']
-    waves = Waves(np.arange(own.start, own.stop), moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3))
+    waves = CosineScores(np.arange(own.start, own.stop), moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3))
     found, misfits = errors_of_waves(waves, SensorModel())
     assert misfits == {'gyroscope'}
     np.testing.assert_allclose(found.factor[own], np.sqrt(1 + 1.5 * 3))

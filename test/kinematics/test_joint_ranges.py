@@ -13,7 +13,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import table_from_urdf
 from imu_calibration.planning.campaign import Campaign, CampaignSettings
 from imu_calibration.planning.planner import NextMotion, make_planner
-from imu_calibration.planning.situation import noise_of_grade
+from imu_calibration.planning.planning_problem import noise_of_grade
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.table_controller import excess, trajectory_from
 from imu_calibration.use_cases.resources import config_file
@@ -81,10 +81,10 @@ def test_an_endless_joint_keeps_to_its_turns_and_is_unwound_at_the_end(start):
     assert limits_of(turntable).wound(position, 0.0).endless[0]
     planner = make_planner(turntable, noise=NOISE, limits=limits)
     reached, at = [], position
-    for number in np.random.default_rng(1).permutation(len(planner.situation.motions))[:60]:
-        points = planner.situation.motions[number].points(at)
+    for number in np.random.default_rng(1).permutation(len(planner.problem.motions))[:60]:
+        points = planner.problem.motions[number].points(at)
         if len(points):
-            assert excess(trajectory_from(rest_at(at[None]), points), limits)[0] <= 1e-9, planner.situation.motions[number].words
+            assert excess(trajectory_from(rest_at(at[None]), points), limits)[0] <= 1e-9, planner.problem.motions[number].words
             reached.append(points.position[:, 0])
             at = points.position[-1]
     assert np.ptp(np.concatenate(reached)) > 2 * np.pi and np.abs(np.concatenate(reached) - start).max() <= 2 * np.pi

@@ -9,7 +9,7 @@ import yaml
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document import files
 from imu_calibration.kinematics.urdf import StaticTransforms, table_from_urdf
-from imu_calibration.planning.situation import noise_of_grade
+from imu_calibration.planning.planning_problem import noise_of_grade
 from imu_calibration.simulation.sensor_noise import GRADES
 
 pytest.importorskip('rclpy')
@@ -111,7 +111,7 @@ def test_an_arm_from_a_file_stands_as_static_transforms_say_and_the_noise_is_tha
     monkeypatch.setattr(planner_node.files, 'read_noise', lambda path: (path, 'figures'))
     monkeypatch.setattr(planner_node, 'expected_noise', lambda figures, grade, rate: noise if figures == (tmp_path / 'noise.yaml', 'figures') else None)
     node = bench.start(PlannerNode, {'urdf_file': str(tmp_path / 'arm.urdf'), 'imu_link': 'tool', 'table_file': 'none', 'noise_file': str(tmp_path / 'noise.yaml')})
-    found = node._make_campaign().planner.situation.noise   # with the joints' own
+    found = node._make_campaign().planner.problem.noise   # with the joints' own
     assert all(found[sensor].white_variance is noise[sensor].white_variance for sensor in noise)
 
 

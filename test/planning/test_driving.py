@@ -27,7 +27,7 @@ from imu_calibration.planning.campaign import (
 )
 from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
 from imu_calibration.planning.path_watch import PathWatch
-from imu_calibration.planning.situation import noise_of_grade
+from imu_calibration.planning.planning_problem import noise_of_grade
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.sensor_noise import GRADES
@@ -424,8 +424,8 @@ def test_what_a_diagnosis_said_becomes_motions_that_tell_its_causes_apart():
         position = step.motion.points(position).position[-1]
     assert 0 < len(motions) < 40   # and it ends by itself
     mate = {f'gyroscope.gyro_quadratic.{axis}': size for axis, size in zip('xyz', (1e-3, -1e-3, 1e-3), strict=True)}
-    told = separator_of(table, known, Suspect('gyro_scale_asymmetry', ('gyro_quadratic',), sizes | mate), noise=noise).situation
-    imitating = separator.situation.goal.causes[1]
+    told = separator_of(table, known, Suspect('gyro_scale_asymmetry', ('gyro_quadratic',), sizes | mate), noise=noise).problem
+    imitating = separator.problem.goal.causes[1]
     quadratic = told.goal.causes[1].size * told.coordinates.units[told.coordinates.model.slices['gyroscope', 'gyro_quadratic']]
     np.testing.assert_allclose(quadratic, [1e-3, -1e-3, 1e-3])   # as the diagnosis says, not as a usual session would have it
     assert not np.allclose(told.goal.causes[1].size, imitating.size, rtol=0.1)

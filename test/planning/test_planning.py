@@ -21,13 +21,13 @@ from imu_calibration.estimation.window_statistics import batch_statistics
 from imu_calibration.kinematics.motion_limits import limits_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import table_from_urdf
-from imu_calibration.planning import belief
-from imu_calibration.planning.belief import SAMPLING, WindowPredictor, exact_information
+from imu_calibration.planning import posterior
 from imu_calibration.planning.campaign import make_separator
 from imu_calibration.planning.coordinates import Coordinates
+from imu_calibration.planning.motion_library import MotionKind, MotionLibrary
 from imu_calibration.planning.planner import GOAL_REACHED, make_planner
-from imu_calibration.planning.repertoire import MotionKind, Repertoire
-from imu_calibration.planning.situation import LEAST_RESTS, Situation, noise_of_grade
+from imu_calibration.planning.planning_problem import LEAST_RESTS, PlanningProblem, noise_of_grade
+from imu_calibration.planning.posterior import SAMPLING, WindowPredictor, exact_information
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.profiles import make_profile
@@ -135,17 +135,17 @@ def test_a_plan_at_the_default_tolerances_has_windows_enough_to_be_proven_and_di
 
 def test_the_sd_of_a_plan_stays_below_the_tolerance_by_the_scatter_of_the_noise_estimate(plan, table):
     """Plans used to stop at the tolerance itself, which every second estimate of the noise exceeds."""
-    situation = make_planner(table, noise=NOISE, tolerances=TIGHT).situation
-    rests = [situation.windows[k][0] for k in situation.first_rests(0)][1:]   # of equal length
-    factor, rng = situation.variance_factor(rests), np.random.default_rng(9)
+    problem = make_planner(table, noise=NOISE, tolerances=TIGHT).problem
+    rests = [problem.windows[k][0] for k in problem.first_rests(0)][1:]   # of equal length
+    factor, rng = problem.variance_factor(rests), np.random.default_rng(9)
     exceeded = [max(np.mean([variance * inflation for variance, inflation in
                              (batch_statistics(rng.normal(size=(130, 6))) for _ in rests)], axis=0)) > factor for _ in range(400)]
     assert 1.2 < factor < 1.8
     # 20 expected of 400, by counting 4.4 standard deviations apart; the estimate is skewed where chi-square is not
     assert np.mean(exceeded) < 0.1
-    kept = [next(k for k, m in enumerate(situation.motions) if (m.kind, m.text) == (motion.kind, motion.text)
+    kept = [next(k for k, m in enumerate(problem.motions) if (m.kind, m.text) == (motion.kind, motion.text)
                  and np.array_equal(m.place, motion.place)) for motion in plan.motions]
-    cautious = situation.coordinates.excess(situation.covariance_after(kept, 0, cautious=True)[0])
+    cautious = problem.coordinates.excess(problem.covariance_after(kept, 0, cautious=True)[0])
     assert cautious.max() <= 1 + 1e-6 and (plan.sd / plan.tolerances)[plan.wanted].max() < 0.98
 
 
@@ -187,7 +187,7 @@ def test_squares_and_asymmetries_of_a_gyroscope_are_told_apart_by_other_speeds(t
     values[model.slices[pair[0]]] = [2e-4, -2e-4, 2e-4]
     calibration = Calibration(model, values, np.diag(model.prior()[1]**2), ('weak',) * len(values))
     separator = make_separator(table, calibration, pair, noise=NOISE)
-    before = separator.situation.goal.missing(separator.situation.belief(separator.known).known)
+    before = separator.problem.goal.missing(separator.problem.posterior(separator.known).known)
     assert 0 < separator.plan(longest=6.0).seconds <= 6.0
     plan = separator.plan(longest=180.0)
     assert before == ('gyro_quadratic and gyro_scale_asymmetry',) and plan.missing == () and plan.seconds < 180
@@ -244,8 +244,8 @@ def test_a_plan_does_what_the_mixed_design_of_the_papers_does_in_no_more_time():
     model = choose_model(CalibrationOptions(), table)
     predictor = WindowPredictor(table, Coordinates(model, tolerances_of(model)), NOISE, rate=100.0)
     windows = predictor.predict([profile.segments])[0]
-    situation = Situation(Repertoire(table, limits_of(table)), predictor.coordinates, NOISE)
-    times, factor = np.array([window.middle for window in windows]), situation.variance_factor(windows)
+    problem = PlanningProblem(MotionLibrary(table, limits_of(table)), predictor.coordinates, NOISE)
+    times, factor = np.array([window.middle for window in windows]), problem.variance_factor(windows)
     information = exact_information(windows, times, NOISE, factor=factor)   # with the same probability as the plan
     sd = predictor.coordinates.sd(np.linalg.inv(predictor.coordinates.prior_information + information))
     worst = {}
@@ -317,11 +317,11 @@ def test_the_memory_of_a_plan_does_not_grow_with_the_square_of_an_arms_joints(ta
         lengths.append(len(motion))
         return columns(*arguments, motion=motion, **options)
 
-    monkeypatch.setattr(belief, 'columns', counted)
+    monkeypatch.setattr(posterior, 'columns', counted)
     model = choose_model(CalibrationOptions(), table)
     move = MotionBuilder(3)
     move.move_to([1.0, -0.5, 2.0])
     found = WindowPredictor(table, Coordinates(model, tolerances_of(model)), NOISE, rate=100.0).predict([tuple(move.segments)] * 1000)
-    assert len(found) == 1000 and max(lengths) <= 1.05 * belief.BELIEF_BLOCK_ROWS < sum(lengths) / 2
+    assert len(found) == 1000 and max(lengths) <= 1.05 * posterior.BELIEF_BLOCK_ROWS < sum(lengths) / 2
     arm = table_from_urdf(SEVEN_AXES, 'imu_link', {'gravity': 9.81})
-    assert 20 <= len(Repertoire(arm, limits_of(arm)).places) <= 45
+    assert 20 <= len(MotionLibrary(arm, limits_of(arm)).places) <= 45

@@ -6,11 +6,11 @@ import pytest
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.kinematics.motion_limits import limits_of
-from imu_calibration.planning.belief import additive_bound, exact_information, least_bias_variance, relax
 from imu_calibration.planning.coordinates import Coordinates
+from imu_calibration.planning.motion_library import MotionLibrary
 from imu_calibration.planning.planner import make_planner
-from imu_calibration.planning.repertoire import Repertoire
-from imu_calibration.planning.situation import Situation, noise_of_grade
+from imu_calibration.planning.planning_problem import PlanningProblem, noise_of_grade
+from imu_calibration.planning.posterior import additive_bound, exact_information, least_bias_variance, relax
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.sensor_noise import GRADES
 
@@ -18,16 +18,16 @@ from worlds.random_tables import random_table
 from worlds.stands import quarter_tolerances, stand
 
 
-def situation(seed=3, grade='tactical', share=0.2):
+def problem(seed=3, grade='tactical', share=0.2):
     """A situation on a random table, tolerances a share of the usual ones."""
     table = random_table(np.random.default_rng(seed))
     model = choose_model(CalibrationOptions(), table)
     coordinates = Coordinates(model, share * tolerances_of(model))
-    return Situation(Repertoire(table, limits_of(table)), coordinates, noise_of_grade(GRADES[grade].noise, 100.0))
+    return PlanningProblem(MotionLibrary(table, limits_of(table)), coordinates, noise_of_grade(GRADES[grade].noise, 100.0))
 
 
 def test_windows_together_never_say_more_than_the_sum_of_their_bounds():
-    made, rng = situation(), np.random.default_rng(8)
+    made, rng = problem(), np.random.default_rng(8)
     windows, times, _ = made.timed(rng.permutation(len(made.motions))[:30], 0)
     slack = sum(additive_bound(window, made.noise) for window in windows) - exact_information(windows, times, made.noise)
     values = np.linalg.eigvalsh(slack)
@@ -37,7 +37,7 @@ def test_windows_together_never_say_more_than_the_sum_of_their_bounds():
 
 
 def test_the_bound_would_be_wrong_if_the_floor_were_larger():
-    made = situation()
+    made = problem()
     number = next(k for k, motion in enumerate(made.motions) if motion.kind == 'pose')
     moves = [k for k, motion in enumerate(made.motions) if motion.kind == 'move'][:2]
     windows, times, _ = made.timed([number, *moves] * 20, 0)
@@ -48,7 +48,7 @@ def test_the_bound_would_be_wrong_if_the_floor_were_larger():
 
 @pytest.mark.parametrize('seed', range(4))
 def test_no_random_plan_that_meets_the_tolerances_is_shorter_than_the_bound(seed):
-    made, rng = situation(), np.random.default_rng(seed)
+    made, rng = problem(), np.random.default_rng(seed)
     bound = made.lower_bound()
     sequence, place = [], 0
     while made.coordinates.excess(made.covariance_after(sequence, place)[0]).max() > 1.0:
@@ -64,7 +64,7 @@ def test_the_certificate_of_a_problem_with_a_known_answer():
 
 
 def test_biases_that_wander_more_than_their_tolerance_take_their_time_whatever_is_measured():
-    made = situation(share=1.0)
+    made = problem(share=1.0)
     tolerance = made.coordinates.tolerances[0]
     made.noise['accelerometer'] = made.noise['accelerometer'].__class__(made.noise['accelerometer'].white_variance, np.ones(3),
                                                                         bias_processes=(BiasProcess(3.0 * tolerance, 50.0),))
@@ -87,4 +87,4 @@ def test_the_bound_counts_the_white_noise_beside_a_wandering_bias():
     planner = make_planner(table, noise=noise_of_grade(GRADES['industrial'].noise, 100.0), tolerances=quarter_tolerances(table))
     plan = planner.plan()
     assert plan.missing == () and plan.lower_bound_seconds <= plan.seconds <= 1.25 * plan.lower_bound_seconds
-    assert planner.situation.lower_bound() > 75.0
+    assert planner.problem.lower_bound() > 75.0

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.motion_limits import limits_of
-from imu_calibration.planning.repertoire import MotionKind, Repertoire, rest_at, up_at
+from imu_calibration.planning.motion_library import MotionKind, MotionLibrary, rest_at, up_at
 from imu_calibration.simulation.table_controller import excess, trajectory_from
 
 from worlds.random_tables import random_table
@@ -20,7 +20,7 @@ def test_no_trajectory_leaves_the_limits_of_any_joint(seed, count, ends):
     rng = np.random.default_rng(seed)
     table = random_table(rng, count, ends)
     limits = limits_of(table)
-    motions = Repertoire(table, limits).motions
+    motions = MotionLibrary(table, limits).motions
     position = np.clip(np.zeros(count), limits.lower, limits.upper)
     for number in rng.permutation(len(motions))[:12]:
         points = motions[number].points(position)
@@ -31,22 +31,22 @@ def test_no_trajectory_leaves_the_limits_of_any_joint(seed, count, ends):
 
 
 def test_every_kind_of_motion_ends_at_its_own_place_for_the_next_one_to_start_from():
-    repertoire = Repertoire(random_table(np.random.default_rng(1), 3, 0.5), limits_of(random_table(np.random.default_rng(1), 3, 0.5)))
-    for motion in repertoire.motions:
+    library = MotionLibrary(random_table(np.random.default_rng(1), 3, 0.5), limits_of(random_table(np.random.default_rng(1), 3, 0.5)))
+    for motion in library.motions:
         if motion.segments:
             away = motion.segments[-1].end - motion.place
-            turns = np.where(repertoire.limits.endless, np.round(away / (2 * np.pi)), 0.0)
+            turns = np.where(library.limits.endless, np.round(away / (2 * np.pi)), 0.0)
             np.testing.assert_allclose(away, 2 * np.pi * turns, atol=1e-9, err_msg=motion.words)
 
 
 def test_spins_come_in_both_senses_and_rests_in_many_attitudes():
     table = random_table(np.random.default_rng(2), 3)
-    repertoire = Repertoire(table, limits_of(table))
-    spins = [motion for motion in repertoire.motions if motion.kind is MotionKind.SPIN]
+    library = MotionLibrary(table, limits_of(table))
+    spins = [motion for motion in library.motions if motion.kind is MotionKind.SPIN]
     rates = [spin.segments[1].rate_from for spin in spins]
     senses = {(int(np.argmax(np.abs(rate))), float(np.sign(rate[np.argmax(np.abs(rate))]))) for rate in rates}
     assert senses == {(joint, sense) for joint in range(3) for sense in (1.0, -1.0)}
-    assert len({tuple(motion.place) for motion in repertoire.motions if motion.kind is MotionKind.POSE}) >= 20
+    assert len({tuple(motion.place) for motion in library.motions if motion.kind is MotionKind.POSE}) >= 20
 
 
 def test_what_points_up_at_a_place_is_what_the_accelerometer_feels_there():

@@ -62,7 +62,7 @@ def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(g
     with refused(InputError, 'on_table') as caught:
         calibrate(change(block), table)
     assert all(word in str(caught.value) for word in words) and '\n' not in str(caught.value)
-    assert ('--imu-topic' in caught.value.told({'imu_topic': '--imu-topic'})) == (not words)   # no joint and no delay explains it
+    assert ('--imu-topic' in caught.value.with_hint({'imu_topic': '--imu-topic'})) == (not words)   # no joint and no delay explains it
 
 
 @pytest.mark.parametrize(('seconds', 'delay', 'side'), [(0.5, '0.5 s', 'behind'), (-0.5, '0.5 s', 'ahead'), (2.0, '2.0 s', 'behind')])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose, told
+from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis, diagnose
 from imu_calibration.cli.main import main
 from imu_calibration.document import files
 from imu_calibration.effects.expressions import ColumnGroup
@@ -18,7 +18,7 @@ from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.proposals import propose
 from imu_calibration.selection.regime_variables import variables_of
 from imu_calibration.selection.regimes import find_regimes
-from imu_calibration.selection.residual_analysis import Examination, without_superseded
+from imu_calibration.selection.residual_analysis import ResidualAnalysis, without_superseded
 from imu_calibration.selection.residual_fit import BlockFits, share_interval, share_removed
 
 from worlds import physics
@@ -42,12 +42,12 @@ def recorded(kind=None, seed=5):
 def looked(kind=None, seed=5):
     """Return (examination, sensor -> blocks, cause) of a session."""
     recording, cause = recorded(kind, seed)
-    found = Examination.of(investigate(recording.windows, recording.table, recording.model), recording.table)
+    found = ResidualAnalysis.of(investigate(recording.windows, recording.table, recording.model), recording.table)
     return found, found.blocks, cause
 
 
 def fits_of(found, blocks):
-    space, used = found.attempt.space, found.attempt.search.used(found.named)
+    space, used = found.problem.space, found.problem.search.indices(found.named)
     return BlockFits(blocks, used, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
 
 
@@ -116,15 +116,15 @@ def test_a_formula_is_found_and_judged_on_windows_that_took_no_part(kind, text):
 def test_nothing_is_proposed_where_nothing_is_hidden_even_when_asked():
     found, blocks, _ = looked()
     for sensor in blocks:
-        assert propose(blocks[sensor], found.attempt, fits_of(found, blocks[sensor])) is None
-        assert not find_regimes(blocks[sensor], found.attempt, found.attempt.search.used([]), joint_names=('outer', 'middle', 'inner'))
+        assert propose(blocks[sensor], found.problem, fits_of(found, blocks[sensor])) is None
+        assert not find_regimes(blocks[sensor], found.problem, found.problem.search.indices([]), joint_names=('outer', 'middle', 'inner'))
 
 
 def test_a_formula_that_takes_little_off_held_out_windows_is_a_story(monkeypatch):
     found, blocks, cause = looked('scale_under_load')
     fits = fits_of(found, blocks['gyroscope'])
     monkeypatch.setattr(proposals, 'share_removed', lambda before, after: 0.5)
-    assert propose(blocks['gyroscope'], found.attempt, fits) is None
+    assert propose(blocks['gyroscope'], found.problem, fits) is None
 
 
 def test_halves_that_disagree_make_no_formula(monkeypatch):
@@ -133,7 +133,7 @@ def test_halves_that_disagree_make_no_formula(monkeypatch):
     late = sensor.time > np.median(sensor.time)
     turned = tuple(np.concatenate([part[:, :-1], np.where(late, -1.0, 1.0)[:, None] * part[:, -1:]], axis=1) for part in sensor.design)
     upset = replace(sensor, design=turned)
-    told = propose(upset, found.attempt, fits_of(found, upset))
+    told = propose(upset, found.problem, fits_of(found, upset))
     assert told is None or 'f_z * w' not in str(told.columns)
 
 
@@ -143,7 +143,7 @@ def test_shares_are_of_the_locked_windows():
     before = fits.fit()
     true = np.stack([np.interp(blocks['gyroscope'].time, cause.time, cause.signal[:, axis]) for axis in range(3)], axis=1)[:, None]
     after = fits.fit(true)
-    assert len(before.window) == blocks['gyroscope'].locked.sum() and set(before.window) == set(np.flatnonzero(found.attempt.locked))
+    assert len(before.window) == blocks['gyroscope'].locked.sum() and set(before.window) == set(np.flatnonzero(found.problem.locked))
     low, high = share_interval(before, after, np.random.default_rng(0))
     assert low <= share_removed(before, after) <= high
 
@@ -158,7 +158,7 @@ def test_the_place_is_found(kind, size):
 
 def test_the_formula_is_printed():
     (recording, cause), (found, _, _) = recorded('scale_under_load'), looked('scale_under_load')
-    lines = '\n'.join(diagnosis_lines(told(recording.table, without_superseded(found))))
+    lines = '\n'.join(diagnosis_lines(build_diagnosis(recording.table, without_superseded(found))))
     assert all(part in lines for part in ('f_z * w', f'axis {min(cause.axes)}', found.proposal('gyroscope').sentence))
 
 
@@ -172,8 +172,8 @@ def test_a_mount_that_bends_is_named_in_both_sensors():
 
 def test_a_cause_of_the_table_that_spoils_the_other_sensor_is_no_cause(monkeypatch):
     found, blocks, cause = looked('scale_under_load', 6)
-    search = found.attempt.search
-    question = next(q for q in found.attempt.questions if q.name == 'load_compliance')
+    search = found.problem.search
+    question = next(q for q in found.problem.questions if q.name == 'load_compliance')
     assert not search.shows_alike([question], question) and not found.named
 
 

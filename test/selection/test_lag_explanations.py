@@ -11,9 +11,9 @@ from imu_calibration.selection.lag_explanations import (
     MAX_CLOCK_LOSS,
     Explanation,
     LagExplanations,
+    _described_together,
     _Option,
     _rivals,
-    _told_together,
     simplest,
 )
 from imu_calibration.selection.search import TIE
@@ -42,8 +42,8 @@ def test_where_nothing_rests_a_shared_clock_may_be_behind_by_a_share_of_what_lag
 def test_a_story_that_did_not_help_gives_way_to_a_shorter_one():
     both, one = explanation(0.0, time_offset=9e-3, gyro_delay=3e-3), explanation(50.0, time_offset=10e-3)
     explanations = LagExplanations(None, [both, one], [], None)
-    assert explanations.told() is both
-    assert explanations.told(1, [both]) is one
+    assert explanations.select() is both
+    assert explanations.select(1, [both]) is one
 
 
 def test_what_did_not_help_is_not_tried_again_under_another_name():
@@ -64,7 +64,7 @@ def option(sensor, kind, lags, sd=1e-5, cost=0.0):
 
 def test_two_delays_share_a_clock_at_the_price_of_their_difference():
     one, two = option('accelerometer', ('delay',), [9.0e-3]), option('gyroscope', ('delay',), [9.02e-3])
-    told = {tuple(each.lags): each for each in _told_together(one, two, [])}
+    told = {tuple(each.lags): each for each in _described_together(one, two, [])}
     assert set(told) == {('accel_delay', 'gyro_delay'), ('time_offset',), ('time_offset', 'gyro_delay')}
     assert told['time_offset',].lags['time_offset'] == pytest.approx(9.01e-3)
     assert told['time_offset',].cost - told['accel_delay', 'gyro_delay'].cost == pytest.approx(0.5 * 2.0 - 1.0)
@@ -73,9 +73,9 @@ def test_two_delays_share_a_clock_at_the_price_of_their_difference():
 
 def test_a_filter_is_never_negative_but_a_clock_may_be_early():
     one, two = option('accelerometer', ('delay',), [-3e-3]), option('gyroscope', ('delay', 'bandwidth'), [-3e-3, 4e-3])
-    told = [each.lags for each in _told_together(one, two, [])]
+    told = [each.lags for each in _described_together(one, two, [])]
     assert told == [pytest.approx({'time_offset': -3e-3, 'gyro_bandwidth': 4e-3})]
-    assert not list(_told_together(one, option('gyroscope', ('bandwidth',), [-1e-3]), []))
+    assert not list(_described_together(one, option('gyroscope', ('bandwidth',), [-1e-3]), []))
 
 
 def test_rivals_are_the_members_of_other_explanations_and_only_the_nearest_moves_parameters():

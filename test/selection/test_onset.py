@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.table_diagnosis import told
+from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
 from imu_calibration.effects.base import Role
 from imu_calibration.selection.investigation import investigate
 
@@ -42,7 +42,7 @@ def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
     else:
         assert changes == {'reference.encoder_zero.middle': pytest.approx(-0.03, abs=6e-4)}   # columns at zero: slip^2 / 2
     assert not found.named and len(found.used) < 0.7 * len(recording.windows)   # the longer part, in which nothing is left to find
-    diagnosis = told(recording.table, found)
+    diagnosis = build_diagnosis(recording.table, found)
     assert diagnosis.onset is onset and set(onset.to_mapping()['parameters']) == set(changes)
     assert any(f'{onset.time:.1f} +-' in line for line in diagnosis_lines(diagnosis))
     assert not any(rest.significant for rest in diagnosis.unexplained.values())
@@ -56,15 +56,15 @@ def test_no_change_and_a_gradual_change_are_no_onset(cause):
 def test_a_clock_of_another_rate_is_named():
     _, found = investigated(Clock(rate=200e-6))
     assert [question.name for question in found.named] == ['clock_rate'] and found.onset is None
-    value, = found.attempt.values(found.named)[list(found.named[0].parameters)]
+    value, = found.problem.values(found.named)[list(found.named[0].parameters)]
     assert value == pytest.approx(200e-6 / (1 + 200e-6), abs=1e-7)   # stamps run at this rate by themselves
 
 
 def test_a_step_of_the_clock_is_named_with_its_time():
     recording, found = investigated(Clock(step=8e-3))
     assert [question.name for question in found.named] == ['clock_step'] and found.onset is None
-    step, time = found.attempt.values(found.named)[list(found.named[0].parameters)]
+    step, time = found.problem.values(found.named)[list(found.named[0].parameters)]
     assert step == pytest.approx(8e-3, abs=1e-4) and abs(time - moment_of(recording, 0.6)) < 1.5
-    model = found.attempt.recording.model
+    model = found.problem.recording.model
     assert model.prior()[0][model.slices['reference', 'clock_step']][1] == time   # least squares does not move it
     assert model.find('reference', Role.DELAY) is not None

@@ -35,9 +35,9 @@ def found_in(monkeypatch, rest_of_x, rough_of_x=1.0):
     rough[:, 0] *= rough_of_x
     blocks = blocks_of(rest, rough)
     monkeypatch.setattr(regimes, 'variables_of', lambda blocks, names: ranged('time', TIME, 's', starts=STARTS))
-    attempt = SimpleNamespace(space=SimpleNamespace(prior_sd=np.array([100.0]), prior_mean=np.zeros(1)),
+    problem = SimpleNamespace(space=SimpleNamespace(prior_sd=np.array([100.0]), prior_mean=np.zeros(1)),
                               recording=SimpleNamespace(kind=np.array(['swing'] * WINDOWS)))
-    return regimes.find_regimes(blocks, attempt, [0], joint_names=())
+    return regimes.find_regimes(blocks, problem, [0], joint_names=())
 
 
 @pytest.mark.parametrize('first', [122, 127])

@@ -14,9 +14,9 @@ from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, Refe
 from imu_calibration.estimation.noise_search import FLICKER_MARK, BiasProcessSearch, NoiseLikelihood
 from imu_calibration.selection import gain, investigation
 from imu_calibration.selection import unexplained as rests
-from imu_calibration.selection.attempt import Attempt
 from imu_calibration.selection.evidence import MOST_FITS, Evidence, WindowEvidence, folds_of, locked_windows
 from imu_calibration.selection.explained_share import SHOWS, Explained, ExplainedWindows, pruned
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.noise_beside_effects import _needed_smooth, drift_prior, natural_processes, plausible_processes
 from imu_calibration.selection.parameter_space import ParameterSpace, parameter_space, scatter_of_each, white_means
 from imu_calibration.selection.questions import Question
@@ -136,7 +136,7 @@ class Squares:
     """Sums of squares of 30 windows that choose and of 10 locked ones: shares of 97 about the means and of 0.15 in the means that a finding leaves."""
 
     evidence = SimpleNamespace(fold=np.arange(30) % 6, fit=lambda used, number=None: (used, None))
-    search = SimpleNamespace(used=len)
+    search = SimpleNamespace(indices=len)
     space = SimpleNamespace(reduced=lambda used, values: np.array([float(values)]))
 
     def __init__(self, within=0.4, means=0.12):
@@ -222,7 +222,7 @@ def test_what_is_unexplained_where_an_effect_does_not_show_does_not_hide_it(with
 @pytest.mark.parametrize(('least_part', 'share'), ((SHOWS, 1.0), (-np.inf, 0.5)))
 def test_an_effect_is_compared_with_the_excess_of_the_parts_in_which_it_counts(least_part, share):
     """It removes the excess of turns; as much remains in poses, which by hand count too, because parts are few."""
-    explained = Explained(SimpleNamespace(used=len), lambda used: {'accelerometer': np.array([[1100.0], [100.0 if used else 1100.0]])},
+    explained = Explained(SimpleNamespace(indices=len), lambda used: {'accelerometer': np.array([[1100.0], [100.0 if used else 1100.0]])},
                           {'accelerometer': np.array([100.0, 100.0])}, least_part=least_part)
     assert explained.share([QUADRATIC], QUADRATIC) == pytest.approx(share)
     assert explained.rest([QUADRATIC]) == pytest.approx(1000.0)
@@ -335,7 +335,7 @@ def test_curves_in_time_that_are_nearly_collinear_are_named_together(behind, ali
                                                                            ('gyro_rate_product', (7, 8, 9))))
     evidence = Known(lambda used: 0.0 if 3 in used else 2 * (behind + 1.0) if used & {0, 7} else 120000.0)
     search = Search(evidence, (), [warm, drift, product])
-    assert [mate.name for mate, _ in search.class_mates([drift], drift)] == alike
+    assert [mate.name for mate, _ in search.confounded([drift], drift)] == alike
 
 
 def test_what_was_resolved_is_not_replaced():
@@ -383,9 +383,9 @@ def test_windows_agree_on_a_finding(scatter, sure):
     (value,), covariance = evidence.fit([0])
     assert value / np.sqrt(covariance[0, 0]) > 30.0
     assert (evidence.p_value_by_scatter([0], [0]) < 1e-6) == sure
-    attempt = Attempt.__new__(Attempt)
-    attempt.evidence, attempt.questions, attempt.search = evidence, [QUADRATIC] * 30, SimpleNamespace(used=lambda chosen: (0,))
-    assert attempt.windows_agree([QUADRATIC], QUADRATIC) == sure
+    problem = LinearisedProblem.__new__(LinearisedProblem)
+    problem.evidence, problem.questions, problem.search = evidence, [QUADRATIC] * 30, SimpleNamespace(indices=lambda chosen: (0,))
+    assert problem.windows_agree([QUADRATIC], QUADRATIC) == sure
 
 
 def test_a_window_that_scatters_more_within_has_a_less_certain_mean():
@@ -466,42 +466,42 @@ def test_what_is_smooth_in_time_has_to_beat_the_wander_of_the_bias():
 @pytest.mark.parametrize(('apart', 'agree'), ((2.0, True), (6.0, False)))
 def test_halves_agree_within_chance(apart, agree):
     """An effect of two standard deviations of the whole, halves that differ by so many of theirs."""
-    attempt = Attempt.__new__(Attempt)
-    attempt.space = SimpleNamespace(prior_sd=np.full(1, 1e6), prior_mean=np.zeros(1))
-    attempt._halves = [np.array([[1.0, value], [value, value**2]]) for value in (apart / np.sqrt(2), -apart / np.sqrt(2))]
-    attempt.search = SimpleNamespace(used=lambda chosen: (0,))
-    attempt.evidence = SimpleNamespace(fit=lambda used: (np.array([2.0]), np.eye(1) / 2))
-    assert attempt.agrees_in_halves([QUADRATIC], QUADRATIC) == agree
+    problem = LinearisedProblem.__new__(LinearisedProblem)
+    problem.space = SimpleNamespace(prior_sd=np.full(1, 1e6), prior_mean=np.zeros(1))
+    problem._halves = [np.array([[1.0, value], [value, value**2]]) for value in (apart / np.sqrt(2), -apart / np.sqrt(2))]
+    problem.search = SimpleNamespace(indices=lambda chosen: (0,))
+    problem.evidence = SimpleNamespace(fit=lambda used: (np.array([2.0]), np.eye(1) / 2))
+    assert problem.agrees_in_halves([QUADRATIC], QUADRATIC) == agree
 
 
-def with_attempt(monkeypatch, paid=None, agree=lambda question: True, windows_agree=lambda named, question: True, standing=list):
+def with_problem(monkeypatch, paid=None, agree=lambda question: True, windows_agree=lambda named, question: True, drop_insignificant=list):
     """Return an attempt of which the residual in the sensor's unit and the halves say this."""
-    monkeypatch.setattr(investigation, '_sure_reduction', lambda attempt, kept, each: (paid or {}).get(each, 0.5))
+    monkeypatch.setattr(investigation, '_sure_reduction', lambda problem, kept, each: (paid or {}).get(each, 0.5))
     monkeypatch.setattr(investigation, '_needed_reduction', lambda *given: 0.0)
-    return SimpleNamespace(search=SimpleNamespace(allowed=lambda named, question: True, standing=standing), windows_agree=windows_agree, agrees_in_halves=lambda named, question: agree(question))
+    return SimpleNamespace(search=SimpleNamespace(allowed=lambda named, question: True, drop_insignificant=drop_insignificant), windows_agree=windows_agree, agrees_in_halves=lambda named, question: agree(question))
 
 
 def test_a_finding_lowers_the_residual_in_the_sensors_own_unit(monkeypatch):
-    attempt = with_attempt(monkeypatch, {CUBIC: -0.01})
-    assert investigation._that_help(attempt, None, [QUADRATIC, CUBIC]) == [QUADRATIC]
+    problem = with_problem(monkeypatch, {CUBIC: -0.01})
+    assert investigation._that_help(problem, None, [QUADRATIC, CUBIC]) == [QUADRATIC]
 
 
 def test_what_the_windows_disagree_on_is_not_named(monkeypatch):
-    attempt = with_attempt(monkeypatch, windows_agree=lambda named, question: question is not CUBIC)
-    assert investigation._that_help(attempt, None, [QUADRATIC, CUBIC]) == [QUADRATIC]
+    problem = with_problem(monkeypatch, windows_agree=lambda named, question: question is not CUBIC)
+    assert investigation._that_help(problem, None, [QUADRATIC, CUBIC]) == [QUADRATIC]
 
 
 def test_what_the_halves_disagree_on_is_denied(monkeypatch):
-    attempt = with_attempt(monkeypatch, agree=lambda question: question is not CUBIC)
-    assert investigation._agreed(attempt, None, [QUADRATIC, CUBIC]) == ([QUADRATIC], [CUBIC])
+    problem = with_problem(monkeypatch, agree=lambda question: question is not CUBIC)
+    assert investigation._agreed(problem, None, [QUADRATIC, CUBIC]) == ([QUADRATIC], [CUBIC])
 
 
 def test_what_is_nothing_without_what_was_taken_out_is_not_named(monkeypatch):
     """A clock that is early and a lag that makes up for it: each is significant beside the other alone."""
     losses = {frozenset(): 100.0, frozenset([0]): 99.0, frozenset([1]): 99.0, frozenset([0, 1]): 0.0}
-    standing = Search(Known(losses.get), (), [QUADRATIC, CUBIC]).standing
+    drop_insignificant = Search(Known(losses.get), (), [QUADRATIC, CUBIC]).drop_insignificant
     for agree, named in ((lambda question: True, [QUADRATIC, CUBIC]), (lambda question: question is not CUBIC, [])):
-        assert investigation._agreed(with_attempt(monkeypatch, agree=agree, standing=standing), None, [QUADRATIC, CUBIC])[0] == named
+        assert investigation._agreed(with_problem(monkeypatch, agree=agree, drop_insignificant=drop_insignificant), None, [QUADRATIC, CUBIC])[0] == named
 
 
 @pytest.mark.parametrize(('value', 'fall', 'asked_about'), ((-1e-4, 100.0, True), (1e-4, 100.0, False), (-1e-4, 2.0, False)))

@@ -13,10 +13,10 @@ def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monk
     monkeypatch.setattr(unexplained, '_explanations', lambda recording: {})
     n = 40
     noise = SimpleNamespace(variance_beside_bias=lambda kind, count, duration, keys: np.full((n, 3), 4e-6), bias_variance=1e-2)
-    attempt = SimpleNamespace(space=SimpleNamespace(mean={'gyroscope': [np.full((n, 1), 0.01)] * 3}, places=lambda sensor, axis: [0]),
+    problem = SimpleNamespace(space=SimpleNamespace(mean={'gyroscope': [np.full((n, 1), 0.01)] * 3}, places=lambda sensor, axis: [0]),
                               recording=SimpleNamespace(kind=None, count=None, duration=None, keys=(), time=np.arange(n)))
     explained = SimpleNamespace(floor=SimpleNamespace(noise={'gyroscope': noise}), n_means=3 * n, n_within=1, sigma=lambda sensor, excess: (20.0, 0.0))
-    rest = unexplained._rest(attempt, explained, 'gyroscope', np.outer([9.0 * 3 * n, 0.0], np.full(3, 1 / 3)), np.ones(1))
+    rest = unexplained._rest(problem, explained, 'gyroscope', np.outer([9.0 * 3 * n, 0.0], np.full(3, 1 / 3)), np.ones(1))
     assert rest.significant
     np.testing.assert_allclose(rest.rms, 3 * 2e-3)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.diagnosis.table_diagnosis import told
+from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.catalogue import term
 from imu_calibration.kinematics.table import Table
@@ -93,7 +93,7 @@ class Loud(Cause):
 def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size):
     """Both are random to least squares, whose noise they increase: the diagnosis of either was "nothing found"."""
     recording = record(5, None, 'realistic', through_bag=False, cause=Loud(size))
-    found = told(recording.table, investigate(recording.windows, recording.table, recording.model)).unexplained
+    found = build_diagnosis(recording.table, investigate(recording.windows, recording.table, recording.model)).unexplained
     assert [found[sensor].significant for sensor in ('accelerometer', 'gyroscope')] == [size > 0] * 2
     if size:
         assert [(rest.axes, rest.correlates_with) for rest in found.values()] == [(('z',), None), (('y',), IN_MOTION)]

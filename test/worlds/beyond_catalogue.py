@@ -7,9 +7,9 @@ import numpy as np
 
 from imu_calibration.calibration.by_evidence import extended_solution
 from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
-from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.selection.attempt import Attempt
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.unexplained import biases_off
 
 from worlds.hiding import record
@@ -45,9 +45,9 @@ def _known(found, recording):
     for effect in effects:
         model = model.with_effect(effect.sensor, effect.name)
     windows = [window for window in recording.windows if window.kind != 'unused']
-    attempt = Attempt(windows, recording.table, model, effects=[], locked=np.zeros(len(windows), bool))
-    solution = extended_solution(attempt.space, attempt.noise, model, chosen=[])
-    unsure = Demand(moves=tuple((moved, 1.0) for moved in biases_off(model, found.unexplained)))
+    problem = LinearisedProblem(windows, recording.table, model, effects=[], locked=np.zeros(len(windows), bool))
+    solution = extended_solution(problem.space, problem.noise, model, chosen=[])
+    unsure = ModelExtension(moves=tuple((moved, 1.0) for moved in biases_off(model, found.unexplained)))
     sd = np.sqrt(np.diag(unsure.applied(solution).covariance))
     places = {name: solution.model.param_names.index(name) for name in SensorModel().param_names}
     return {name: (float(solution.values[k]), float(sd[k])) for name, k in places.items()}

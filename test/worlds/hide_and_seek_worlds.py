@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose, told
+from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis, diagnose
 from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import heldout_gain
 from imu_calibration.selection.investigation import investigate
@@ -86,13 +86,13 @@ def failed(what, problem):
 def oracle(recording, effect):
     """Return the held-out rms of what was found over that of a searcher who was told the effect, or None where nothing compares."""
     found = investigate(recording.windows, recording.table, recording.model)
-    asked = [q for q in found.attempt.questions if q.name == effect]
+    asked = [q for q in found.problem.questions if q.name == effect]
     if not asked or found.limits:
         return None
-    search = found.attempt.search
-    best = min(asked, key=lambda q: search.evidence.loss(search.used([q])))
+    search = found.problem.search
+    best = min(asked, key=lambda q: search.evidence.loss(search.indices([q])))
     sensors = sensors_of(best.effect)
-    pair = [heldout_gain(found.attempt, [], choice, sensors=sensors) for choice in (found.named, [best])]
+    pair = [heldout_gain(found.problem, [], choice, sensors=sensors) for choice in (found.named, [best])]
     alike = (pair[0].measure, pair[0].sensor) == (pair[1].measure, pair[1].sensor)
     return pair[0].heldout_rms_after / pair[1].heldout_rms_after if alike else None
 
@@ -112,7 +112,7 @@ def effects_of_seed(seed, noise, effects, profile='random', table='three_axis', 
 def nothing_of(sizes, seed, noise):
     """Return the row of the session that gave the sizes."""
     empty, start = sizes.recording, time.process_time()
-    diagnosis = told(empty.table, sizes.found)
+    diagnosis = build_diagnosis(empty.table, sizes.found)
     return [_row(diagnosis, empty.truth, None, sizes.seconds + time.process_time() - start, {'part': 'none', 'seed': seed, 'noise': noise})]
 
 

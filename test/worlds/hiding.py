@@ -109,9 +109,9 @@ class Sizes:
     def __init__(self, recording):
         self.recording, start = recording, time.process_time()
         self.found = investigate(recording.windows, recording.table, recording.model)
-        self.seconds, self.attempt = time.process_time() - start, self.found.attempt
-        evidence, used = self.attempt.evidence, np.array(self.attempt.search.baseline)
-        prior = np.diag(1 / self.attempt.space.prior_sd[used]**2)
+        self.seconds, self.problem = time.process_time() - start, self.found.problem
+        evidence, used = self.problem.evidence, np.array(self.problem.search.baseline)
+        prior = np.diag(1 / self.problem.space.prior_sd[used]**2)
         normal = evidence.total[:-1, :-1]
         self.information = normal - normal[:, used] @ np.linalg.solve(normal[np.ix_(used, used)] + prior, normal[used])
 
@@ -124,8 +124,8 @@ class Sizes:
         value = pattern(effect, seed)
         direction, n_parameters = self._direction(effect, value)
         strength = direction @ self.information @ direction
-        seen = np.sqrt(threshold_noncentrality(n_parameters, len(self.attempt.questions)) / strength)
-        read = least_angle(self._question(effect, value)[0].effect, self.attempt.search.encoder_step) / np.max(np.abs(value))
+        seen = np.sqrt(threshold_noncentrality(n_parameters, len(self.problem.questions)) / strength)
+        read = least_angle(self._question(effect, value)[0].effect, self.problem.search.encoder_step) / np.max(np.abs(value))
         size = factor * max(seen, read)
         if effect.endswith('_bias_drift'):
             return np.append(size * value[:3], value[3])
@@ -138,24 +138,24 @@ class Sizes:
         sized = {name: self._direction(name, np.ravel(value)) for name, value in hidden.items() if not name.endswith('_saturation') and value is not None}
         left = {name: np.inf for name in hidden}
         for name, (direction, n_parameters) in sized.items():
-            others = [k for other in sized if other != name for q in self.attempt.questions if q.name == other for k in q.parameters]
-            known = self.information[np.ix_(others, others)] + np.diag(1 / self.attempt.space.prior_sd[others]**2)
+            others = [k for other in sized if other != name for q in self.problem.questions if q.name == other for k in q.parameters]
+            known = self.information[np.ix_(others, others)] + np.diag(1 / self.problem.space.prior_sd[others]**2)
             shared = self.information[others] @ direction
             strength = direction @ self.information @ direction - shared @ np.linalg.solve(known, shared)
-            left[name] = float(np.sqrt(max(strength, 0.0) / threshold_noncentrality(n_parameters, len(self.attempt.questions))))
+            left[name] = float(np.sqrt(max(strength, 0.0) / threshold_noncentrality(n_parameters, len(self.problem.questions))))
         return left
 
     def _direction(self, effect, value):
         question, shape = self._question(effect, value)
-        direction = np.zeros(self.attempt.space.size)
+        direction = np.zeros(self.problem.space.size)
         direction[list(question.parameters)] = shape
         return direction, value.size
 
     def _question(self, effect, value):
-        asked = [q for q in self.attempt.questions if q.name == effect]
+        asked = [q for q in self.problem.questions if q.name == effect]
         if not effect.endswith('_bias_drift'):
             return asked[0], value.ravel()
-        nearest = int(np.argmin(np.abs(np.log(self.attempt.constants / value[3]))))
+        nearest = int(np.argmin(np.abs(np.log(self.problem.constants / value[3]))))
         return asked[nearest], value[:3]
 
 

@@ -43,16 +43,16 @@ def gain_of_findings(found: Investigation, table: Table, before: Sequence[Questi
         Sensors that the difference acts on.
 
     """
-    attempt, applied = found.attempt, _compensated(found, before, after)
+    problem, applied = found.problem, _compensated(found, before, after)
     if applied is None:
-        return heldout_gain(attempt, before, after, sensors=sensors)
-    chosen = gain_in_turn(attempt, *applied, sensors=sensors)
+        return heldout_gain(problem, before, after, sensors=sensors)
+    chosen = gain_in_turn(problem, *applied, sensors=sensors)
     sides, sums = [applied_parameters(found, some) for some in applied], DistanceSums()
-    start = max(judged_from_of(model, attempt.duration) for model, *_ in sides)
-    held_out = [window for window, locked in zip(found.used, attempt.locked) if locked and window.time[0] >= start]
+    start = max(judged_from_of(model, problem.duration) for model, *_ in sides)
+    held_out = [window for window, locked in zip(found.used, problem.locked) if locked and window.time[0] >= start]
     for group in chunks(held_out):
         for window, *residuals in zip(group, *(_errors(group, table, *side) for side in sides)):
-            sums.add(window, residuals, attempt.noise)
+            sums.add(window, residuals, problem.noise)
     return sums.gains(chosen.sensor, APPLIED)[chosen.measure]
 
 
@@ -65,13 +65,13 @@ def _compensated(found, before, after):
 
 def applied_parameters(found: Investigation, chosen: Sequence[Question]) -> tuple[SensorModel, np.ndarray, np.ndarray]:
     """Return (model, values, values as compensation applies them) of a choice of effects, estimated without the locked windows."""
-    attempt, wide = found.attempt, found.attempt.recording.model
-    model = replace(attempt.baseline, temperature_ref_c=wide.temperature_ref_c)
+    problem, wide = found.problem, found.problem.recording.model
+    model = replace(problem.baseline, temperature_ref_c=wide.temperature_ref_c)
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
-    values = model.start_from(wide, attempt.values(chosen))
+    values = model.start_from(wide, problem.values(chosen))
     model = model.at(values)
-    centre = uncorrected_on_table(model, values, attempt.recording.accumulated(wide), gathered=wide).centre if not_applied(model) else {}
+    centre = uncorrected_on_table(model, values, problem.recording.accumulated(wide), gathered=wide).centre if not_applied(model) else {}
     return model, values, applied_values(model, values, centre)
 
 

@@ -10,9 +10,9 @@ from imu_calibration.calibration.by_evidence import baseline_options, calibrate_
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, formula_gain, to_mapping
 from imu_calibration.calibration.diagnosis.hand_diagnosis import told_by_hand
 from imu_calibration.calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST
-from imu_calibration.calibration.diagnosis.table_diagnosis import told
+from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
 from imu_calibration.calibration.diagnosis.traces import residual_traces
-from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.hand_workflow import evident_result, read_by_hand
 from imu_calibration.calibration.table_calibration import conclude, solve_recordings
 from imu_calibration.core.units import error_text
@@ -45,7 +45,7 @@ class DiagnosisResult:
     """A diagnosis with the content of its files and its report."""
 
     diagnosis: Diagnosis
-    """Findings, candidates and unexplained residuals."""
+    """PoseScan, candidates and unexplained residuals."""
     calibration: Calibration
     """The extended calibration; that of the baseline without findings."""
     tolerances: np.ndarray
@@ -113,7 +113,7 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
     calibrated = calibrate_by_evidence([source], table, replace(options, as_asked=False), provenance=provenance, mapper=read)
     if calibrated.found is None:
         raise too_few_windows(len(calibrated.result.gathered.spreads[0].windows))
-    result, diagnosis = calibrated.result, told(table, calibrated.found, calibrated=calibrated.result.solution)
+    result, diagnosis = calibrated.result, build_diagnosis(table, calibrated.found, calibrated=calibrated.result.solution)
     proposed = _with_proposals(source, table, options, result, diagnosis, provenance)
     traces = residual_traces(windows, table, diagnosis.baseline, after=proposed or diagnosis.solution)
     diagnosis = replace(diagnosis, traces=traces)
@@ -134,7 +134,7 @@ def _with_proposals(source, table, options, result, diagnosis, provenance):
                      reference_model=texts['reference'] or 'none', catalogue=catalogue, as_asked=True)
     solution, gathered, gathered_model = solve_recordings([source], table, chosen)
     # A formula determines changes of the output, not its zero: biases of the affected axes keep the uncertainty.
-    unsure = Demand(moves=tuple((moved, 1.0) for moved in biases_off(model, diagnosis.unexplained)))
+    unsure = ModelExtension(moves=tuple((moved, 1.0) for moved in biases_off(model, diagnosis.unexplained)))
     return conclude(unsure.applied(solution), gathered, gathered_model, table=table, options=chosen, provenance=provenance).calibration
 
 

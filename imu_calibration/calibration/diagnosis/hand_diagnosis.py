@@ -37,15 +37,15 @@ def traces_of(baseline: HandCalibration, hand: HandCalibration) -> Traces:
 
 def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
     """Return the result of an investigation as a Diagnosis; `hand` is a calibration with all findings."""
-    inquiry, named = found.inquiry, list(found.named)
+    problem, named = found.problem, list(found.named)
     before, after = _with_residuals(found.baseline), _with_residuals(hand)
 
     def gain_of(place):
         return gain_by_hand(found, named[:place], after=named[:place + 1], sensor=named[place].sensor)
 
-    findings = tuple(finding(inquiry.search, named, place, solution=after, share=inquiry.explained.share, gain_of=gain_of,
+    findings = tuple(finding(problem.search, named, place, solution=after, share=problem.explained.share, gain_of=gain_of,
                              motion_of=motions_of) for place in range(len(named)))
     gain = gain_by_hand(found, [], after=named, sensor=named[0].sensor) if named else None
     count = len(found.baseline.poses.start)
-    return Diagnosis(findings, found.unexplained, candidates_of(inquiry.search, named),
+    return Diagnosis(findings, found.unexplained, candidates_of(problem.search, named),
                      tuple(found.not_testable), before, after, gain, count, count if named else 0, traces_of(found.baseline, hand))

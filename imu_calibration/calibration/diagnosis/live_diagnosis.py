@@ -7,8 +7,8 @@ from typing import Any
 from imu_calibration.calibration.by_evidence import windows_to_ask
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines, in_words, nothing_named
-from imu_calibration.calibration.diagnosis.table_diagnosis import told
-from imu_calibration.calibration.from_solution import Demand
+from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
+from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.session import LiveSnapshot
 from imu_calibration.core.errors import ImuCalibrationError
@@ -49,7 +49,7 @@ class Answer:
 
     state: LiveState
     """For display."""
-    demand: Demand | None = None
+    extension: ModelExtension | None = None
     """Effects that the windows support; None where they could not be tested."""
 
 
@@ -71,9 +71,10 @@ class DiagnosisQuestion:
             evidence = self.snapshot.evidence()
             if evidence.found is None:
                 raise too_few_windows(sum(len(spread.windows) for spread in self.snapshot.gathered.spreads))
-            found, demand, calibrated = evidence.found, evidence.demand, None if evidence.demand.changes.lacking else evidence.solution
+            found, extension = evidence.found, evidence.extension
+            calibrated = None if extension.changes.lacking else evidence.solution
             del evidence   # its columns, of a wider model than those of the session, need much memory
-            return Answer(describe(told(self.snapshot.table, found, calibrated=calibrated)), demand)
+            return Answer(describe(build_diagnosis(self.snapshot.table, found, calibrated=calibrated)), extension)
         except ImuCalibrationError as error:
             return Answer(LiveState(WAITING, str(error)))
 

@@ -1,4 +1,4 @@
-"""Findings as sentences, and motions that separate effects."""
+"""PoseScan as sentences, and motions that separate effects."""
 
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
@@ -128,7 +128,7 @@ def candidates_of(search: Search, named: Sequence[Question], *, agree: Callable[
     """
     found, mates, rows = {question.name for question in named}, {}, {}
     for question in named:
-        for mate, _ in search.class_mates(named, question):
+        for mate, _ in search.confounded(named, question):
             mates.setdefault(mate.name, question.name)
     for question in search.questions:
         alone = search.score([], question)
@@ -154,7 +154,7 @@ def verdict_of(name: str, alone: Score, beside: Score | None, *, found: Collecti
     alone, beside : Score
         Evidence on top of the baseline, and on top of the findings (None for a finding).
     found : set of str
-        Findings.
+        PoseScan.
     mates : dict
         Effects that would do as well -> finding.
 
@@ -207,7 +207,7 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
     text = sentence(question.effect, parameters, gain)
     if score.implausible:
         text += f' It {beyond_known(explained, question.sensor)}. It is in no model unless requested.'
-    mates = [*rivals, *(mate for mate, _ in search.class_mates(named, question)
+    mates = [*rivals, *(mate for mate, _ in search.confounded(named, question)
                         if mate.name not in {rival.name for rival in rivals} and shows(place, mate, gain))]
     return Finding(question.name, question.sensor, text, parameters, score.p_value, score.gain, explained, gain,
                    tuple(mate.name for mate in mates),

@@ -18,7 +18,7 @@ from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import Gain, gain_in_turn
 from imu_calibration.selection.investigation import Investigation
-from imu_calibration.selection.residual_analysis import Examination, inquire
+from imu_calibration.selection.residual_analysis import ResidualAnalysis, inquire
 
 MATE = 0.5
 """Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's reduction."""
@@ -54,11 +54,11 @@ def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, bia
         When there are too few windows to hold any out.
 
     """
-    result = told(table, inquire(windows, table, model, bias_processes=bias_processes))
+    result = build_diagnosis(table, inquire(windows, table, model, bias_processes=bias_processes))
     return replace(result, traces=residual_traces(windows, table, result.baseline, after=result.solution))
 
 
-def told(table: Table, found: Investigation, *, calibrated: Solution | None = None) -> Diagnosis:
+def build_diagnosis(table: Table, found: Investigation, *, calibrated: Solution | None = None) -> Diagnosis:
     """
     Return the result of an investigation as a Diagnosis, without traces.
 
@@ -71,10 +71,10 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
         Solution of a model with all findings, with the reported parameters; default: the solution of the investigation.
 
     """
-    attempt, named, limits = found.attempt, found.named, found.limits
-    rests = Examination.of(found, table).unexplained
-    baseline = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=[])
-    solution = extended_solution(attempt.space, attempt.noise, attempt.baseline, chosen=named,
+    problem, named, limits = found.problem, found.named, found.limits
+    rests = ResidualAnalysis.of(found, table).unexplained
+    baseline = extended_solution(problem.space, problem.noise, problem.baseline, chosen=[])
+    solution = extended_solution(problem.space, problem.noise, problem.baseline, chosen=named,
                                  saturations=limits) if named or limits else baseline
 
     def gain_of(place):
@@ -83,7 +83,7 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
     def shows(place, mate, gain):
         if gain.sensor not in sensors_of(mate.effect):
             return False
-        own, other = (gain_in_turn(attempt, named[:place], [*named[:place], each], sensors=[gain.sensor]).reduction
+        own, other = (gain_in_turn(problem, named[:place], [*named[:place], each], sensors=[gain.sensor]).reduction
                       for each in (named[place], mate))
         return MATE * own <= other
 
@@ -95,23 +95,23 @@ def told(table: Table, found: Investigation, *, calibrated: Solution | None = No
     told_by = calibrated or solution
     findings = [_clipping(limit, told_by) for limit in limits]
     strange = found.implausible
-    findings += [finding(attempt.search, named, place, solution=solution if named[place] in strange else told_by,
+    findings += [finding(problem.search, named, place, solution=solution if named[place] in strange else told_by,
                          share=found.explained.share, gain_of=gain_of, motion_of=motion_of,
                          shows=shows, rivals=_rivals(found, named[place]))
                  for place in range(len(named))]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
-    return Diagnosis(tuple(findings), rests, candidates_of(attempt.search, named, agree=attempt.windows_agree),
+    return Diagnosis(tuple(findings), rests, candidates_of(problem.search, named, agree=problem.windows_agree),
                      tuple(found.not_testable), baseline, solution, gain_of_findings(found, table, [], after=named, sensors=sensors),
-                     len(found.used), int(np.sum(attempt.locked)), onset=found.onset)
+                     len(found.used), int(np.sum(problem.locked)), onset=found.onset)
 
 
 def _rivals(found, question):
     """Return alternatives to a finding that fit nearly as well, and doubtful effects that would replace half of it."""
     near = [rival.other for rival in found.rivals if rival.question.name == question.name]
-    values = dict(zip(found.attempt.space.names, found.attempt.values(found.named)))
-    own = [found.attempt.space.names[k] for k in question.parameters]
-    for other in found.doubtful:
-        moved = found.search.moved_by(found.named, other, found.attempt.space.names)
+    values = dict(zip(found.problem.space.names, found.problem.values(found.named)))
+    own = [found.problem.space.names[k] for k in question.parameters]
+    for other in found.rejected:
+        moved = found.search.moved_by(found.named, other, found.problem.space.names)
         near += [other] if any(abs(moved.get(name, 0.0)) > HALF * abs(values[name]) for name in own) else []
     return near
 

@@ -17,7 +17,7 @@ from imu_calibration.kinematics.rotations import lever_matrix
 
 
 @dataclass(frozen=True)
-class Holding:
+class Capability:
     """Effects of one kind of one sensor."""
 
     sensor: str
@@ -43,28 +43,28 @@ class Holding:
         return next(effect for effect in CATALOGUE.effects().values() if self.covers(effect))
 
 
-def _both(**kind) -> tuple[Holding, ...]:
-    return tuple(Holding(sensor, **kind) for sensor in SENSORS)
+def _both(**kind) -> tuple[Capability, ...]:
+    return tuple(Capability(sensor, **kind) for sensor in SENSORS)
 
 
 OFFSETS = _both(role=Role.OFFSET)
 MATRICES = _both(role=Role.LINEAR)
 SCALES = _both(role=Role.LINEAR, own_axis=True)
 THERMAL_OFFSETS = _both(groups=(base.TEMPERATURE,))
-G_SENSITIVITY = (Holding('gyroscope', Role.CROSS),)
-ARMS = (Holding('accelerometer', Role.ARMS),)
+G_SENSITIVITY = (Capability('gyroscope', Role.CROSS),)
+ARMS = (Capability('accelerometer', Role.ARMS),)
 SLOW_OFFSETS = OFFSETS + THERMAL_OFFSETS
 """Effects that an estimator with biases in its state estimates itself."""
 
 
-def of(sensor: str, holdings: tuple[Holding, ...]) -> tuple[Holding, ...]:
+def of(sensor: str, capabilities: tuple[Capability, ...]) -> tuple[Capability, ...]:
     """Return the holdings of one sensor."""
-    return tuple(holding for holding in holdings if holding.sensor == sensor)
+    return tuple(capability for capability in capabilities if capability.sensor == sensor)
 
 
-def holding_of(effect: Effect, holdings: tuple[Holding, ...]) -> Holding | None:
+def capability_of(effect: Effect, capabilities: tuple[Capability, ...]) -> Capability | None:
     """Return the holding that covers an effect, or None."""
-    return next((holding for holding in holdings if holding.covers(effect)), None)
+    return next((capability for capability in capabilities if capability.covers(effect)), None)
 
 
 def _zeros(*shape):
@@ -94,27 +94,27 @@ class AffineImu:
     temperature_range_c: tuple[float, float] | None = None
     """Where the thermal part was measured, degrees Celsius; None: not known."""
 
-    def value(self, holding: Holding) -> np.ndarray:
+    def value(self, capability: Capability) -> np.ndarray:
         """Return the values of the effects of one kind."""
         for kinds, part in ((OFFSETS, self.bias), (MATRICES + SCALES, self.matrix), (THERMAL_OFFSETS, self.thermal)):
-            if holding in kinds:
-                return part[holding.sensor]
-        return self.cross if holding in G_SENSITIVITY else self.arms
+            if capability in kinds:
+                return part[capability.sensor]
+        return self.cross if capability in G_SENSITIVITY else self.arms
 
 
-def held_values(calibration: Calibration, effect: Effect, holding: Holding | None) -> np.ndarray:
+def held_values(calibration: Calibration, effect: Effect, capability: Capability | None) -> np.ndarray:
     """Return the values of an effect as the target represents them: its prior where it is not represented, shape (size,)."""
     values = calibration.values[calibration.model.slices[effect.key]]
-    return effect.prior_values() if holding is None else holding.held(values)
+    return effect.prior_values() if capability is None else capability.held(values)
 
 
-def affine_of(calibration: Calibration, holdings: tuple[Holding, ...]) -> AffineImu:
-    """Return that part of a calibration which lies in `holdings`."""
+def affine_of(calibration: Calibration, capabilities: tuple[Capability, ...]) -> AffineImu:
+    """Return that part of a calibration which lies in `capabilities`."""
     limits = calibration.conditions.get('temperature_range_c')
     found = AffineImu(temperature_ref_c=calibration.model.temperature_ref_c, temperature_range_c=tuple(limits) if limits else None)
-    for holding in holdings:
-        for effect in filter(holding.covers, calibration.model.effects):
-            found.value(holding)[...] = held_values(calibration, effect, holding).reshape(effect.shape)
+    for capability in capabilities:
+        for effect in filter(capability.covers, calibration.model.effects):
+            found.value(capability)[...] = held_values(calibration, effect, capability).reshape(effect.shape)
     return found
 
 

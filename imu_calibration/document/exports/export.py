@@ -197,12 +197,12 @@ def holds_in_words(target: Target) -> str:
     if target.whole:
         return 'everything'
     parts: dict[str, list[str]] = {}
-    for holding in target.holds:
-        name = 'scale factors' if holding.own_axis else 'matrix' if holding.role is Role.LINEAR else holding.effect.heading
+    for capability in target.holds:
+        name = 'scale factors' if capability.own_axis else 'matrix' if capability.role is Role.LINEAR else capability.effect.heading
         name = name.split(' (')[0].split(':')[0]
         for sensor in SENSORS:   # a heading may begin with its sensor
             name = name.removeprefix('accel ' if sensor == SENSORS[0] else 'gyro ')
-        parts.setdefault(name, []).append(holding.sensor)
+        parts.setdefault(name, []).append(capability.sensor)
     return ', '.join(name if len(sensors) == 2 else f'{name} ({sensors[0]})' for name, sensors in parts.items()) or '-'
 
 
@@ -271,7 +271,7 @@ def rendered() -> str:
 
 
 def _row(target: Target) -> str:
-    sensors = {holding.sensor for holding in target.estimates}
+    sensors = {capability.sensor for capability in target.estimates}
     estimated = 'biases' + (f' ({", ".join(sensors)})' if len(sensors) == 1 else '') if sensors else '-'
     cells = (f'`{target.name}`', target.title, holds_in_words(target), estimated, target.noise_is or '-', 'yes' if target.read else 'no')
     return f'| {" | ".join(cells)} |\n'

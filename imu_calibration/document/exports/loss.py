@@ -19,11 +19,11 @@ from imu_calibration.document.exports.affine import (
     MATRICES,
     OFFSETS,
     AffineImu,
-    Holding,
+    Capability,
     Placement,
+    capability_of,
     find_pose,
     held_values,
-    holding_of,
     moved,
 )
 from imu_calibration.document.exports.target import Numbers, Read, Readings, Target
@@ -175,7 +175,7 @@ def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, place
     ref, effects = motion.reference, {effect.key: effect for effect in model.effects}
     read = {sensor: sensor_output(model, sensor, values, ref=ref) for sensor in SENSORS}
     without = values.copy()
-    estimated = tuple(e for e in effects.values() if holding_of(e, target.estimates) and e.key in calibration.model.slices)
+    estimated = tuple(e for e in effects.values() if capability_of(e, target.estimates) and e.key in calibration.model.slices)
     for effect in estimated:
         without[model.slices[effect.key]] = effect.prior_values()
     seen = {sensor: sensor_output(model, sensor, without, ref=ref) for sensor in SENSORS}
@@ -192,18 +192,18 @@ def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, place
                 {s: _rms(read[s] - t) for s, t in zip(SENSORS, (ref.force_s, ref.rate_s))}, motion.text)
 
 
-def _whole(calibration, effect, holds: tuple[Holding, ...]):
+def _whole(calibration, effect, holds: tuple[Capability, ...]):
     values = calibration.values[calibration.model.slices[effect.key]]
-    return np.array_equal(held_values(calibration, effect, holding_of(effect, holds)), values)
+    return np.array_equal(held_values(calibration, effect, capability_of(effect, holds)), values)
 
 
 def _lost(calibration, effect, holds, motion):
     """Return the part of the readings due to the part of an effect that is not represented."""
     model, values = invertible_values(calibration)
-    holding, less = holding_of(effect, holds), values.copy()
-    less[model.slices[effect.key]] = held_values(calibration, effect, holding)
+    capability, less = capability_of(effect, holds), values.copy()
+    less[model.slices[effect.key]] = held_values(calibration, effect, capability)
     change = [sensor_output(model, effect.sensor, v, ref=motion.reference) for v in (values, less)]
-    return LostEffect(effect, holding is not None, _rms(change[0] - change[1]))
+    return LostEffect(effect, capability is not None, _rms(change[0] - change[1]))
 
 
 def _rms(values):
@@ -248,16 +248,16 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
 
 
 def _document(target: Target, found: Read, imu: AffineImu, axes: str, path: Any, frame_id: str) -> Calibration:
-    holds = tuple(holding for holding in target.holds if holding not in found.lacks)
+    holds = tuple(capability for capability in target.holds if capability not in found.lacks)
     names: dict[str, tuple[str, ...]] = {sensor: tuple(_names(sensor, holds, imu)) for sensor in SENSORS}
     model = SensorModel(names['accelerometer'], names['gyroscope'], temperature_ref_c=imu.temperature_ref_c)
     values, sd = model.prior()
     status = np.full(len(values), HELD, dtype=object)
     for effect in model.effects:
-        holding, part = holding_of(effect, holds), model.slices[effect.key]
-        if holding is not None:
-            values[part] = imu.value(holding).ravel()
-            known = np.eye(3).ravel() > 0 if holding.own_axis else np.full(effect.size, True)
+        capability, part = capability_of(effect, holds), model.slices[effect.key]
+        if capability is not None:
+            values[part] = imu.value(capability).ravel()
+            known = np.eye(3).ravel() > 0 if capability.own_axis else np.full(effect.size, True)
             status[part] = np.where(known, WEAK, HELD)
     name = getattr(path, 'name', str(path))
     reason = f'imported from {target.title} ({name}) without uncertainties, its error was not measured on a recording'
@@ -271,12 +271,12 @@ def _document(target: Target, found: Read, imu: AffineImu, axes: str, path: Any,
         notes=("next: measure its error on a recording: 'imu_calibration check'",)))
 
 
-def _names(sensor: str, holds: tuple[Holding, ...], imu: AffineImu):
+def _names(sensor: str, holds: tuple[Capability, ...], imu: AffineImu):
     """Yield the effects of a sensor in a document: bias and matrix always, further ones where the file gives them a value."""
     for always in (*OFFSETS, *MATRICES):
         if always.sensor == sensor:
             yield always.effect.name
-    for holding in holds:
-        further = holding.effect.name not in (OFFSETS[0].effect.name, MATRICES[0].effect.name)
-        if holding.sensor == sensor and further and np.any(imu.value(holding)):
-            yield holding.effect.name
+    for capability in holds:
+        further = capability.effect.name not in (OFFSETS[0].effect.name, MATRICES[0].effect.name)
+        if capability.sensor == sensor and further and np.any(imu.value(capability)):
+            yield capability.effect.name

@@ -12,7 +12,7 @@ from imu_calibration.allan.figures import Densities
 from imu_calibration.core.documents import from_text, plain, to_text
 from imu_calibration.core.errors import InputError, printable, shortened
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.exports.affine import AffineImu, Holding, Placement, as_mounted
+from imu_calibration.document.exports.affine import AffineImu, Capability, Placement, as_mounted
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.rotations import lever_matrix
 
@@ -198,7 +198,7 @@ class Read:
 
     numbers: Numbers
     """As `Target.numbers` makes them."""
-    lacks: tuple[Holding, ...] = ()
+    lacks: tuple[Capability, ...] = ()
     """Effects that the program supports and this file lacks."""
     sample_sd: dict[str, float] = field(default_factory=dict)
     """Sensor -> standard deviation of the noise of a sample, where the file has it."""
@@ -216,9 +216,9 @@ class Target:
     """How the program uses the numbers, in its own names."""
     source: str
     """Where that was read: project, file."""
-    holds: tuple[Holding, ...] = ()
+    holds: tuple[Capability, ...] = ()
     """Effects that it can hold."""
-    estimates: tuple[Holding, ...] = ()
+    estimates: tuple[Capability, ...] = ()
     """Effects that it estimates at run time: no loss, independent of the file."""
     whole: bool = False
     """Whether it has the complete document: `numbers` are then the document's mapping."""

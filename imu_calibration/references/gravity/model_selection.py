@@ -22,7 +22,7 @@ from imu_calibration.selection.evidence import agree
 from imu_calibration.selection.explained_share import Explained, pruned
 from imu_calibration.selection.gain import OF_MODEL, Gain, gain_of
 from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
-from imu_calibration.selection.search import Named, Search
+from imu_calibration.selection.search import Search, SelectedEffects
 from imu_calibration.selection.unexplained import Unexplained
 
 OUTER = 12
@@ -33,7 +33,7 @@ MIN_FOLD_POSES = 9 + MIN_SPARE_POSES
 """With fewer poses none can be held out."""
 
 
-class Inquiry:
+class HandProblem:
     """Rows of a recording, the evidence on a subset of its poses, and the search."""
 
     def __init__(self, blocks: Sequence[Block], space: HandSpace, questions: Sequence[Question], *, baseline: Sequence[int]):
@@ -43,9 +43,9 @@ class Inquiry:
         self.search = Search(self.evidence, baseline, questions)
         self.explained = Explained(self.search, self.evidence.against_noise, self.evidence.numbers, least_part=-np.inf)
 
-    def without(self, poses: np.ndarray) -> 'Inquiry':
+    def without(self, poses: np.ndarray) -> 'HandProblem':
         """Return the same inquiry without some poses."""
-        return Inquiry(self._blocks_without(poses), self.space, self.questions, baseline=self.search.baseline)
+        return HandProblem(self._blocks_without(poses), self.space, self.questions, baseline=self.search.baseline)
 
     def _blocks_without(self, poses):
         blocks = [block.select(~np.isin(block.pose, poses)) for block in self.blocks]
@@ -53,7 +53,7 @@ class Inquiry:
 
     def values(self, chosen: Sequence[Question]) -> np.ndarray:
         """Return the parameters of `HandSpace` with some effects, zero for all others, shape (q,)."""
-        used, values = list(self.search.used(chosen)), np.zeros(self.space.size)
+        used, values = list(self.search.indices(chosen)), np.zeros(self.space.size)
         values[used] = self.evidence.fit(used)[0]
         return values
 
@@ -81,7 +81,7 @@ class Inquiry:
         """
         if question.effect.smooth:
             return True
-        used = self.search.used(chosen)
+        used = self.search.indices(chosen)
         poses = np.unique(np.concatenate([block.pose for block in self.blocks]))
         # the chosen effects are no noise here, so they are part of the baseline
         first, second, whole = (HandEvidence(self._blocks_without(out), self.space, (), baseline=used).fit(used)
@@ -90,12 +90,12 @@ class Inquiry:
 
 
 @dataclass(frozen=True, eq=False)
-class HandInvestigation(Named):
+class HandInvestigation(SelectedEffects):
     """Result of a search, before its report."""
 
     baseline: HandCalibration
     """The calibration under diagnosis."""
-    inquiry: Inquiry
+    problem: HandProblem
     """Rows, evidence and search."""
     named: Sequence[Question]
     """Questions that became findings, in the order found."""
@@ -107,7 +107,7 @@ class HandInvestigation(Named):
     """Time constants of the warm-ups under test, s."""
     turns: Sequence[TurnData]
     """Turns of the rows."""
-    denied: Sequence[Question] = field(default_factory=list)
+    unstable: Sequence[Question] = field(default_factory=list)
     """Effects that were rejected because the estimates of the two halves differ significantly."""
 
     @property
@@ -118,34 +118,34 @@ class HandInvestigation(Named):
     @property
     def search(self) -> Search:
         """Search of the findings."""
-        return self.inquiry.search
+        return self.problem.search
 
     @cached_property
     def unexplained(self) -> dict[str, Unexplained]:
         """Sensor -> the residual that no finding explains."""
-        blocks, evidence, used = self.inquiry.blocks, self.inquiry.evidence, self.search.used(self.named)
+        blocks, evidence, used = self.problem.blocks, self.problem.evidence, self.search.indices(self.named)
         return {sensor: unexplained_by_hand(self.baseline, blocks, evidence, used=used, sensor=sensor) for sensor in SENSORS}
 
-    def point(self, inquiry: Inquiry, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
-        """Return effect -> initial values for its columns, of the warm-ups among the chosen effects, from the rows of `inquiry`."""
-        fit, warm = inquiry.values(chosen), [question for question in chosen if '@' in question.label]
+    def point(self, problem: HandProblem, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
+        """Return effect -> initial values for its columns, of the warm-ups among the chosen effects, from the rows of `problem`."""
+        fit, warm = problem.values(chosen), [question for question in chosen if '@' in question.label]
         return {q.name: np.append(fit[list(q.parameters)], self.constants[int(q.label.split('@')[1])]) for q in warm}
 
     def gain(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Gain:
         """Return the Gain of one choice over another on poses held out from both fit and choice."""
-        return _gain(self.inquiry, self.held_out, before, after, sensor)
+        return _gain(self.problem, self.held_out, before, after, sensor)
 
     def clearest(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Block:
         """Return the rows of a sensor in which one choice improves most over another by cross-validation of the fit."""
-        return self.inquiry.blocks[_clearest(self.inquiry, before, after, sensor)]
+        return self.problem.blocks[_clearest(self.problem, before, after, sensor)]
 
-    def extended(self, inquiry: Inquiry, chosen: Sequence[Question]) -> tuple[HandModel, np.ndarray, float]:
+    def extended(self, problem: HandProblem, chosen: Sequence[Question]) -> tuple[HandModel, np.ndarray, float]:
         """
         Return the baseline extended by some effects: (model, parameters, the Earth's rate about the vertical, rad/s).
 
-        `inquiry` has the rows for the estimate, those of this investigation or fewer.
+        `problem` has the rows for the estimate, those of this investigation or fewer.
         """
-        hand, point, fit = self.baseline, self.point(inquiry, chosen), inquiry.values(chosen)
+        hand, point, fit = self.baseline, self.point(problem, chosen), problem.values(chosen)
         base = hand.model
         names = {sensor: getattr(base, sensor) + tuple(q.name for q in chosen if q.sensor == sensor) for sensor in SENSORS}
         model = replace(hand.hand_model, model=replace(base, **names, point={**base.point, **point}))
@@ -187,14 +187,14 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
     blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
     base = tuple(range(baseline.hand_model.size + 1))   # including fixed parameters and the Earth's rate: their uncertainty is no finding
     questions = _questions(effects, blocks, space, base, not_testable)
-    inquiry = Inquiry(blocks, space, questions, baseline=base)
-    named = inquiry.named()
-    held_out = _held_out(inquiry) if named else []
-    named = _that_predict(inquiry, held_out, named)
-    denied = [question for question in named if not inquiry.agrees_in_halves(named, question)]
-    if denied:
-        named = _that_predict(inquiry, held_out, [question for question in named if question not in denied])
-    return HandInvestigation(baseline, inquiry, named, held_out, not_testable, constants, gravity_turns(data.turns), denied)
+    problem = HandProblem(blocks, space, questions, baseline=base)
+    named = problem.named()
+    held_out = _held_out(problem) if named else []
+    named = _that_predict(problem, held_out, named)
+    unstable = [question for question in named if not problem.agrees_in_halves(named, question)]
+    if unstable:
+        named = _that_predict(problem, held_out, [question for question in named if question not in unstable])
+    return HandInvestigation(baseline, problem, named, held_out, not_testable, constants, gravity_turns(data.turns), unstable)
 
 
 def too_few_poses(count: int) -> NotObservableError:
@@ -204,11 +204,11 @@ def too_few_poses(count: int) -> NotObservableError:
                               code='too_few_poses')
 
 
-def _that_predict(inquiry, held_out, named):
+def _that_predict(problem, held_out, named):
     """Return the findings that improve the prediction of poses held out from their choice."""
     named = list(named)
     while named:
-        gains = [_gain(inquiry, held_out, named[:k], named[:k + 1], q.sensor) for k, q in enumerate(named)]
+        gains = [_gain(problem, held_out, named[:k], named[:k + 1], q.sensor) for k, q in enumerate(named)]
         poor = [q for q, gain in zip(named, gains) if not gain.ci95[0] > 0]
         if not poor:
             break
@@ -255,41 +255,41 @@ def _questions(effects, blocks, space, base, not_testable):
     return asked
 
 
-def _held_out(inquiry):
+def _held_out(problem):
     """Return fold -> (poses, findings without them, evidence without them): the complete search, repeated."""
-    poses = np.unique(np.concatenate([block.pose for block in inquiry.blocks]))
+    poses = np.unique(np.concatenate([block.pose for block in problem.blocks]))
     found, times = [], min(OUTER, len(poses))
     for number in reported('repeating the search', range(times), times):
         out = poses[number::times]
-        smaller = inquiry.without(out)
+        smaller = problem.without(out)
         found.append((out, smaller.named(), smaller))
     return found
 
 
-def _predicted(inquiry, held_out, allowed):
+def _predicted(problem, held_out, allowed):
     """Return residuals per block of poses held out from fit and choice; only effects called `allowed` are used."""
-    found = [np.full(block.known.shape, np.nan) for block in inquiry.blocks]
+    found = [np.full(block.known.shape, np.nan) for block in problem.blocks]
     for out, named, smaller in held_out:
         chosen = [q for q in named if q.name in allowed]
         values = smaller.values(chosen)
-        for residual, block in zip(found, inquiry.blocks):
+        for residual, block in zip(found, problem.blocks):
             rows = np.isin(block.pose, out)
             residual[rows] = block.rows[rows, :, -1] - block.rows[rows, :, :-1] @ values
     return found
 
 
-def _gain(inquiry, held_out, before, after, sensor):
+def _gain(problem, held_out, before, after, sensor):
     """Return the Gain of one choice over another on poses held out from both fit and choice."""
-    best = _clearest(inquiry, before, after, sensor)
-    block = inquiry.blocks[best]
-    pair = [_predicted(inquiry, held_out, {q.name for q in choice})[best] for choice in (before, after)]
+    best = _clearest(problem, before, after, sensor)
+    block = problem.blocks[best]
+    pair = [_predicted(problem, held_out, {q.name for q in choice})[best] for choice in (before, after)]
     return gain_of_poses(block, pair)
 
 
-def _clearest(inquiry, before, after, sensor):
+def _clearest(problem, before, after, sensor):
     """Return the place of the sensor's block with the largest reduction by cross-validation of the fit."""
-    inside = [inquiry.evidence.heldout_residuals(inquiry.search.used(choice)) for choice in (before, after)]
-    own = [k for k, block in enumerate(inquiry.blocks) if block.sensor == sensor]
+    inside = [problem.evidence.heldout_residuals(problem.search.indices(choice)) for choice in (before, after)]
+    own = [k for k, block in enumerate(problem.blocks) if block.sensor == sensor]
     return min(own, key=lambda k: np.sum(inside[1][k]**2) / max(np.sum(inside[0][k]**2), 1e-300))
 
 

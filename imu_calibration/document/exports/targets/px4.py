@@ -74,7 +74,7 @@ def read(content: bytes, _path: str | Path) -> Read:
         raise InputError('the PX4 parameter file must hold CAL_ACC0 or CAL_GYRO0, it holds none of them; give another file')
     refuse_curved(found, [f'{short}0_X{power}' for short in TC.values() for power in (2, 3)])
     absent = [sensor for sensor in SENSORS if not any(name.startswith(CAL[sensor]) for name in found)]
-    lacks = tuple(holding for sensor in absent for holding in of(sensor, OFFSETS + SCALES))
+    lacks = tuple(capability for sensor in absent for capability in of(sensor, OFFSETS + SCALES))
     return Read(found, lacks)
 
 

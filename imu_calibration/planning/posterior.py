@@ -230,7 +230,7 @@ class WindowPredictor:
         return PlannedWindow(kind, middle, length, samples, means, variance, within)
 
 
-class Belief:
+class Posterior:
     """
     Covariance of the coordinates z and of every bias process of every axis.
 

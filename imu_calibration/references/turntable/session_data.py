@@ -1,4 +1,4 @@
-"""Gathered windows of sessions on a table: stored, held out for the proof, merged."""
+"""SessionData windows of sessions on a table: stored, held out for the proof, merged."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -216,7 +216,7 @@ MAX_LIVE_SAMPLES = 30_000
 """Most samples kept of a live session; a diagnosis needs about 1.5 kB of memory for each of them."""
 
 
-class SpreadWindows:
+class DecimatedWindows:
     """
     Every so many-th window of each kind, so that memory and the time of a search are bounded.
 
@@ -238,9 +238,9 @@ class SpreadWindows:
             self._kept = [(number, window) for number, window in self._kept if number % self._stride == 0]
             self.n_samples = sum(len(window.time) for _, window in self._kept)
 
-    def copy(self) -> 'SpreadWindows':
+    def copy(self) -> 'DecimatedWindows':
         """Return an independent copy; the windows are shared."""
-        twin = SpreadWindows(self.most)
+        twin = DecimatedWindows(self.most)
         twin.n_samples, twin._stride, twin._counts, twin._kept = self.n_samples, self._stride, dict(self._counts), list(self._kept)
         return twin
 
@@ -259,7 +259,7 @@ KEPT_POSES = 2000
 
 
 @dataclass(eq=False)
-class Gathered:
+class SessionData:
     """Reduced data of a recording."""
 
     accumulator: Accumulator = field(default_factory=Accumulator)
@@ -268,7 +268,7 @@ class Gathered:
     """The same windows in folds for cross-validation."""
     kept: list = field(default_factory=list)
     """Windows with all samples, up to KEPT_SAMPLES."""
-    spreads: list[SpreadWindows] = field(default_factory=lambda: [SpreadWindows()])
+    spreads: list[DecimatedWindows] = field(default_factory=lambda: [DecimatedWindows()])
     """Windows for the search of effects, of each of the recordings with most samples, the largest first; empty without a search."""
     poses: list = field(default_factory=list)
     """(time, session, joint positions) of each static window."""
@@ -287,7 +287,7 @@ class Gathered:
     temperature_c: tuple | None = None
     """Lowest and highest temperature."""
     findings: tuple = ()
-    """Findings of the checks of the recording before the estimate (`CheckFinding`)."""
+    """PoseScan of the checks of the recording before the estimate (`CheckFinding`)."""
 
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
@@ -297,7 +297,7 @@ class Gathered:
         self.accumulator.add(window)
         self.held_out.add(window, window.time >= self.judged_from)
 
-    def anew(self, windows: Iterable[WindowStatistics], judged_from: float = 0.0) -> 'Gathered':
+    def anew(self, windows: Iterable[WindowStatistics], judged_from: float = 0.0) -> 'SessionData':
         """Return the same with the windows reduced again."""
         fresh = replace(self, accumulator=Accumulator(), held_out=HeldOut(), judged_from=judged_from)
         for window in windows:
@@ -315,7 +315,7 @@ class Gathered:
         return 0.0 if self.first_stamp_ns is None or self.last_stamp_ns is None else (self.last_stamp_ns - self.first_stamp_ns) * 1e-9
 
 
-def merge(parts: Iterable[Gathered]) -> Gathered:
+def merge(parts: Iterable[SessionData]) -> SessionData:
     """Merge the reduced data of several recordings: the merge step of calibration."""
     parts = list(parts)
     total = parts[0]
@@ -355,13 +355,13 @@ def naming(names: Sequence[str], session: int) -> Callable:
     return call
 
 
-def join(parts: Sequence[Gathered], names: Sequence[str], check: Callable[[Gathered], object]) -> Gathered:
+def join(parts: Sequence[SessionData], names: Sequence[str], check: Callable[[SessionData], object]) -> SessionData:
     """
-    Return the merged Gathered of several recordings.
+    Return the merged SessionData of several recordings.
 
     Parameters
     ----------
-    parts : list of Gathered
+    parts : list of SessionData
         One per recording, in order.
     names : sequence of str
         Names of the recordings.

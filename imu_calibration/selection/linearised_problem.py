@@ -35,7 +35,7 @@ BILINEAR = 2e-3
 """Relative change of the matrix that an effect left out may have caused."""
 
 
-class Attempt:
+class LinearisedProblem:
     """
     One linearisation: the reduced recording, its noise, the evidence and the search.
 
@@ -83,7 +83,7 @@ class Attempt:
         self.search = Search(self.evidence, used, self.questions, encoder_step=judged.recording.encoder_step, any_size=any_size,
                              resolved=resolved)
 
-    def asking_any_size(self) -> 'Attempt':
+    def asking_any_size(self) -> 'LinearisedProblem':
         """Return the same, asking about sizes that are known of no instrument too."""
         other = copy(self)
         other.search = Search(self.evidence, self.search.baseline, self.questions, encoder_step=self.search.encoder_step, any_size=True,
@@ -102,7 +102,7 @@ class Attempt:
 
     def values(self, chosen: Sequence[Question]) -> np.ndarray:
         """Return all parameters of the space for a choice, fitted to the selection windows, with all of the baseline, shape (q,)."""
-        used = self.search.used(chosen)
+        used = self.search.indices(chosen)
         values = np.zeros(self.space.size)
         values[list(used)] = self.evidence.fit(used)[0]
         return self.absolute(values)
@@ -120,8 +120,8 @@ class Attempt:
 
     def curvature_shows(self, chosen: Sequence[Question], question: Question) -> float:
         """Return the evidence of an effect's curvature, nats: its separability from its first derivative."""
-        without = self.search.used([q for q in chosen if q is not question])
-        weight = self.evidence.loss(without) - self.evidence.loss(self.search.used(chosen))
+        without = self.search.indices([q for q in chosen if q is not question])
+        weight = self.evidence.loss(without) - self.evidence.loss(self.search.indices(chosen))
         return weight * _curvature(question, self.values(chosen), self.recording.model, self.duration)**2
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
@@ -132,14 +132,14 @@ class Attempt:
         """
         if question.effect.smooth:
             return True
-        used = self.search.used(chosen)
+        used = self.search.indices(chosen)
         at = [used.index(k) for k in question.parameters]
         fits = [solve_normal(normal, np.asarray(used), self.space.prior_sd, prior_mean=self.space.prior_mean) for normal in self._halves]
         return agree(fits, self.evidence.fit(used), at)
 
     def windows_agree(self, chosen: Sequence[Question], question: Question) -> bool:
         """Return whether an effect is also significant against its scatter over windows (`WindowEvidence.p_value_by_scatter`)."""
-        p_value = self.evidence.p_value_by_scatter(self.search.used(chosen), question.parameters)
+        p_value = self.evidence.p_value_by_scatter(self.search.indices(chosen), question.parameters)
         return p_value * len(self.questions) < FAMILY_WISE
 
     @cached_property
@@ -187,7 +187,7 @@ class Attempt:
         losses = []
         for k in near:
             other = next(q for q in self.questions if q.label == f'{question.name}@{k}')
-            losses.append(self.evidence.loss(self.search.used(chosen[:place] + [other] + chosen[place + 1:])))
+            losses.append(self.evidence.loss(self.search.indices(chosen[:place] + [other] + chosen[place + 1:])))
         logs = np.log(self.constants[near])
         if len(near) < 3:
             return np.append(values[list(question.parameters)], self.constants[number])

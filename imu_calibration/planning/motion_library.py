@@ -194,7 +194,7 @@ REST_PLACES, SPIN_PLACES, SWING_PLACES, TOGETHER_PLACES = 20, 4, 3, 2
 """Places for rests; for spins and for swings of each joint, and for each set of joints, of a chain with at most three joints."""
 
 
-class Repertoire:
+class MotionLibrary:
     """
     The motions of a chain within its limits, and the places where they start and end.
 

@@ -13,10 +13,12 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.window_statistics import BATCH_DOF
-from imu_calibration.planning.belief import (
+from imu_calibration.planning.coordinates import Coordinates, Goal, WithinTolerances
+from imu_calibration.planning.motion_library import MotionKind, MotionLibrary, PlannedMotion
+from imu_calibration.planning.posterior import (
     MAX_REACHABLE_SECONDS,
-    Belief,
     PlannedWindow,
+    Posterior,
     Relaxation,
     WindowPredictor,
     additive_bound,
@@ -25,8 +27,6 @@ from imu_calibration.planning.belief import (
     least_bias_variance,
     relax,
 )
-from imu_calibration.planning.coordinates import Coordinates, Goal, WithinTolerances
-from imu_calibration.planning.repertoire import MotionKind, PlannedMotion, Repertoire
 from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise
 
@@ -42,13 +42,13 @@ ROUNDS_OF_LENGTH = 3
 """Lengths of session that are tried for each of them."""
 
 
-class Situation:
+class PlanningProblem:
     """
     Candidates and criteria of a planner.
 
     Parameters
     ----------
-    repertoire : Repertoire
+    library : MotionLibrary
     coordinates : Coordinates
     noise : dict
         Sensor -> NoiseModel of single samples.
@@ -57,15 +57,15 @@ class Situation:
 
     """
 
-    def __init__(self, repertoire: Repertoire, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float = 100.0):
-        self.repertoire, self.coordinates, self.noise, self.rate = repertoire, coordinates, noise, rate
+    def __init__(self, library: MotionLibrary, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float = 100.0):
+        self.library, self.coordinates, self.noise, self.rate = library, coordinates, noise, rate
         self.goal: Goal = WithinTolerances(coordinates)
-        self.predictor = WindowPredictor(repertoire.table, coordinates, noise, rate=rate)
+        self.predictor = WindowPredictor(library.table, coordinates, noise, rate=rate)
 
     @property
     def motions(self) -> list[PlannedMotion]:
         """Motions to choose from."""
-        return self.repertoire.motions
+        return self.library.motions
 
     @cached_property
     def seconds(self) -> np.ndarray:
@@ -80,16 +80,16 @@ class Situation:
     @cached_property
     def information(self) -> np.ndarray:
         """Information of each motion about z and the biases at its time, shape (k, m, m)."""
-        belief = self.belief()
-        return np.array([belief.information_of(windows) for windows in self.windows])
+        posterior = self.posterior()
+        return np.array([posterior.information_of(windows) for windows in self.windows])
 
     @cached_property
     def ways(self) -> dict[tuple[int, int], tuple[Segment, ...]]:
         """(place, place) -> the move from one to the other."""
-        places, found = self.repertoire.places, {}
+        places, found = self.library.places, {}
         for a, start in enumerate(places):
             for b, end in enumerate(places):
-                builder = MotionBuilder(len(start), limits=self.repertoire.limits, start=start)
+                builder = MotionBuilder(len(start), limits=self.library.limits, start=start)
                 builder.move_to(end)
                 found[a, b] = tuple(builder.segments)
         return found
@@ -103,36 +103,36 @@ class Situation:
     def way_seconds(self) -> np.ndarray:
         """Length of each move, s, shape (n_places, n_places)."""
         seconds = np.array([sum(segment.duration for segment in way) for way in self.ways.values()])
-        return seconds.reshape((len(self.repertoire.places),) * 2)
+        return seconds.reshape((len(self.library.places),) * 2)
 
     def way_information(self, place: int) -> np.ndarray:
         """Return the information about z and the biases in the move from a place to each motion, shape (k, m, m)."""
-        belief, targets = self.belief(), self.repertoire.place_of
-        found = np.array([belief.information_of(self.way_windows[place, b]) for b in range(len(self.repertoire.places))])
+        posterior, targets = self.posterior(), self.library.place_of
+        found = np.array([posterior.information_of(self.way_windows[place, b]) for b in range(len(self.library.places))])
         return found[targets]
 
-    def belief(self, known: np.ndarray | None = None) -> Belief:
+    def posterior(self, known: np.ndarray | None = None) -> Posterior:
         """Return the belief before any motion, with information about z in addition to the prior."""
         prior = self.coordinates.prior_information
-        return Belief(prior if known is None else prior + known, self.noise)
+        return Posterior(prior if known is None else prior + known, self.noise)
 
     def place_near(self, position: np.ndarray) -> int:
         """Return the number of the place nearest to a position, without whole turns of endless joints."""
-        away = self.repertoire.places - position
-        turns = np.where(self.repertoire.limits.endless, np.round(away / (2 * np.pi)), 0.0)
+        away = self.library.places - position
+        turns = np.where(self.library.limits.endless, np.round(away / (2 * np.pi)), 0.0)
         return int(np.argmin(np.abs(away - 2 * np.pi * turns).sum(axis=1)))
 
     def first_rests(self, place: int) -> list[int]:
         """Return the first rests of a session, in widely different attitudes, each place the nearest one; the first rest is longer."""
         rests = [k for k, motion in enumerate(self.motions) if motion.kind is MotionKind.POSE]
-        left, chosen = {int(self.repertoire.place_of[k]): None for k in rests}, []
+        left, chosen = {int(self.library.place_of[k]): None for k in rests}, []
         left = dict.fromkeys(list(left)[:LEAST_RESTS])   # places are in the order of their distance in attitude
         while len(chosen) < LEAST_RESTS and (left or len(chosen) > 1):
             if not left:   # a chain with few attitudes returns to them
-                left = dict.fromkeys(int(self.repertoire.place_of[k]) for k in chosen if self.repertoire.place_of[k] != place)
+                left = dict.fromkeys(int(self.library.place_of[k]) for k in chosen if self.library.place_of[k] != place)
             place = min(left, key=lambda at: self.way_seconds[place, at])
             del left[place]
-            here = [k for k in rests if self.repertoire.place_of[k] == place and (chosen or self.seconds[k] >= FIRST_REST)]
+            here = [k for k in rests if self.library.place_of[k] == place and (chosen or self.seconds[k] >= FIRST_REST)]
             chosen.append(min(here, key=self.seconds.__getitem__))
         return chosen
 
@@ -235,7 +235,7 @@ class Situation:
         """Return (windows, their middles, total time) of motions one after the other from a place, with the ways between them."""
         windows, times, now, place = [], [], 0.0, start
         for number in sequence:
-            target = int(self.repertoire.place_of[number])
+            target = int(self.library.place_of[number])
             way = (self.way_windows[place, target], self.way_seconds[place, target])
             for part, seconds in (way, (self.windows[number], self.seconds[number])):
                 windows += part
