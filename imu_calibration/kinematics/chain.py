@@ -12,7 +12,9 @@ from imu_calibration.kinematics.rotations import Reference, align, earth_rate_n,
 from imu_calibration.kinematics.table import Table, axis_angles, axis_error_directions, base_heading_deg
 
 if TYPE_CHECKING:
+    from imu_calibration.kinematics.joint import Joint
     from imu_calibration.kinematics.joint_motion import JointMotion
+
 
 def with_axis_places(table: Table, errors: np.ndarray) -> Table:
     """
@@ -132,25 +134,19 @@ _CHAIN_BLOCK_SAMPLES = 1024  # samples whose intermediates fit in the processor'
 
 
 class _Link(NamedTuple):
-    """A joint as the recursion needs it."""
+    """A joint with its constants as arrays."""
 
+    joint: Joint
     axis: np.ndarray
     xyz: np.ndarray
     mat_in: np.ndarray
     """From the frame of the link before to the joint's frame, shape (3, 3)."""
-    turns: bool
     column: int
     """Column of the motion that drives it."""
     multiplier: float
     plus: float
-    sag: float
-    wobble: tuple
     across: np.ndarray
     """`axis_error_directions`, shape (2, 3)."""
-
-    @property
-    def leans(self):
-        return bool(self.sag or self.wobble)
 
 
 class _Step(NamedTuple):
@@ -204,7 +200,7 @@ def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarra
     constants = _constants(table)
     steps = _chain_steps(constants, motion)
     # The last columns are up, which a sag needs, the rate, the angular acceleration and the force.
-    needed = 6 if attitude else 3 + any(link.sag for link in constants.links)
+    needed = 6 if attitude else 3 + any(link.joint.sag for link in constants.links)
     base = constants.base[:, -needed:]
     for start in range(0, n_samples, _CHAIN_BLOCK_SAMPLES):
         part = slice(start, min(start + _CHAIN_BLOCK_SAMPLES, n_samples))
@@ -222,14 +218,14 @@ def _chain_steps(constants, motion):
     for link in constants.links:
         offset = offset + matrix.T @ link.xyz
         matrix = link.mat_in @ matrix
-        if not link.leans and not _moves(motion, link.column):
+        if not link.joint.leans and not _moves(motion, link.column):
             at = link.plus + (link.multiplier * motion.position[0, link.column] if len(motion.time) else 0.0)
-            if link.turns:
+            if link.joint.turns:
                 matrix = rotation(-at * link.axis) @ matrix
             else:
                 offset = offset + matrix.T @ (at * link.axis)
             continue
-        before, sense, third = _to_coordinate_axis(link.axis) if link.turns else (np.eye(3), 1.0, 2)
+        before, sense, third = _to_coordinate_axis(link.axis) if link.joint.turns else (np.eye(3), 1.0, 2)
         steps.append(_Step(offset, before @ matrix, link, sense, third, link.across @ before.T))
         matrix, offset = before.T, np.zeros(3)
     return [*steps, _Step(offset + matrix.T @ constants.mount_xyz, constants.mat_sl @ matrix, None)]
@@ -265,12 +261,12 @@ class _Constants(NamedTuple):
 def _constants(table):
     """Return the `_Constants`: thousands of short windows share one table."""
     columns = {name: column for column, name in enumerate(table.joint_names)}
-    links = tuple(_Link(np.array(joint.axis), np.array(joint.xyz), joint.mat_before.T, joint.turns, columns[joint.source],
+    links = tuple(_Link(joint, np.array(joint.axis), np.array(joint.xyz), joint.mat_before.T, columns[joint.source],
                         *((1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset)),
-                        joint.sag, joint.wobble, axis_error_directions(np.array(joint.axis))) for joint in table.joints)
+                        axis_error_directions(np.array(joint.axis))) for joint in table.joints)
     mount_xyz = np.zeros(3) if table.mount_xyz is None else np.array(table.mount_xyz)
     constants = _Constants(_base_columns(table), links, mount_xyz, table.mat_sl, table.gravity_value)
-    for array in (constants.base, constants.mount_xyz, constants.mat_sl, *(part for link in links for part in (*link[:3], link.across))):
+    for array in (constants.base, constants.mount_xyz, constants.mat_sl, *(part for link in links for part in (*link[1:4], link.across))):
         array.flags.writeable = False
     return constants
 
@@ -305,8 +301,8 @@ def _move(columns, step, motion, part):
     factor = step.sense * link.multiplier
     position, rate, acceleration = (factor * values[part, link.column] for values in (motion.position, motion.rate, motion.acceleration))
     position += step.sense * link.plus
-    if link.turns:
-        if link.leans:
+    if link.joint.turns:
+        if link.joint.leans:
             columns = _lean(columns, step, *(step.sense * values for values in (position, rate, acceleration)))
         return _turn(columns, step.third, position, rate, acceleration)
     return _slide(columns, link.axis[:, None], position, rate, acceleration)
@@ -314,16 +310,16 @@ def _move(columns, step, motion, part):
 
 def _lean(columns, step, angle, rate, acceleration):
     """Bring `columns` into the frame of a joint whose axis sags and wobbles, by two small turns across it; the joint is at `angle`."""
-    link, first, second = step.link, (step.third + 1) % 3, (step.third + 2) % 3
+    joint, first, second = step.link.joint, (step.third + 1) % 3, (step.third + 2) % 3
     vector = np.zeros((3, 3, len(angle)))   # derivative, direction, sample
-    if link.wobble:
-        lean = wobble_at(link.wobble, angle, rate, acceleration=acceleration)
+    if joint.wobble:
+        lean = wobble_at(joint.wobble, angle, rate, acceleration=acceleration)
         vector += np.einsum('dn,k->dkn', lean.real, step.across[0]) + np.einsum('dn,k->dkn', lean.imag, step.across[1])
-    if link.sag:
+    if joint.sag:
         up, spin, alpha = columns[:, -4], columns[:, -3], columns[:, -2]
         moves = _cross(up, spin)   # up is fixed in space; the rotation of the Earth is negligible relative to the sag
         axis = np.zeros((3, 1))
-        axis[step.third] = step.sense * link.sag
+        axis[step.third] = step.sense * joint.sag
         vector += np.stack([_cross(each, axis) for each in (up, moves, _cross(moves, spin) + _cross(up, alpha))])
     for which in (first, second):
         columns = _turn(columns, which, *vector[:, which])

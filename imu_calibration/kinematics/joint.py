@@ -44,12 +44,12 @@ def several_numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
     words = {2: 'two', 3: 'three'}[count]
     if isinstance(value, (str, bytes)) or not hasattr(value, '__len__') or len(value) != count:
         raise InputError(f'table: {what} must be {words} numbers, got {value!r}; correct it', code='three_numbers')
-    return tuple(finite_number(item, what, None, high=None, advice=f'give {words} numbers') for item in value)
+    return tuple(finite_number(item, what, advice=f'give {words} numbers') for item in value)
 
 
-def finite_number(value: Any, what: str, low: float | None, *, high: float | None, advice: str) -> float:
+def finite_number(value: Any, what: str, *, low: float = -MAX_TABLE_NUMBER, high: float = MAX_TABLE_NUMBER,
+                  advice: str = 'give a number') -> float:
     """Return one finite number within [low, high], by default the limits of any number of a table."""
-    low, high = -MAX_TABLE_NUMBER if low is None else low, MAX_TABLE_NUMBER if high is None else high
     # YAML 1.1 reads 1e-5, without a point, as text.
     try:
         number = float('nan') if isinstance(value, bool) else float(value)
@@ -231,9 +231,7 @@ def limits_from_mapping(item: Mapping, kind: str) -> JointLimits:
     endless = item.get('endless') or False
     if not isinstance(endless, bool):
         raise InputError(f'table: endless {what} must be true or false, got {endless!r}; correct it', code='not_true_or_false')
-    speed, acceleration = (None if item.get(key) is None else unit * finite_number(item[key], f'{key} {what}', None, high=None,
-                                                                                        advice='give a number')
-                           for key in others)
+    speed, acceleration = (None if item.get(key) is None else unit * finite_number(item[key], f'{key} {what}') for key in others)
     return JointLimits(lower, upper, speed, acceleration, endless)
 
 
@@ -251,8 +249,8 @@ def _require_limits(limits: JointLimits, what: str) -> None:
 
 def _mimic(item: Any, name: str) -> Mimic:
     require_keys(item, ('joint', 'multiplier', 'offset'), f"mimic of joint '{name}'")
-    numbers = {key: finite_number(item[key], f"mimic {key} of joint '{name}'", None, high=None, advice='give a number')
-               for key in ('multiplier', 'offset') if item.get(key) is not None}
+    numbers = {key: finite_number(item[key], f"mimic {key} of joint '{name}'") for key in ('multiplier', 'offset')
+               if item.get(key) is not None}
     if not isinstance(item.get('joint'), str):
         raise InputError(f"table: mimic of joint '{name}' must name a joint, got {item.get('joint')!r}; add joint: NAME")
     return Mimic(item['joint'], **numbers)

@@ -50,19 +50,19 @@ class JointRows:
         return PenalisedSpline(vstack([self._position[0], design], format='csr'), self._position[1] + bands, n_kinds=2)
 
 
-def fit_with_velocity(rows: JointRows, fit: Smooth, position: np.ndarray, *, velocity: np.ndarray, trend: 'Trend') -> tuple[bool, Smooth]:
-    """Return whether the velocities agree with the fit to the positions, and a fit to both when it is better for them."""
+def fit_with_velocity(rows: JointRows, fit: Smooth, position: np.ndarray, *, velocity: np.ndarray, trend: 'Trend') -> Smooth:
+    """Return the fit to positions and velocities; `fit`, that to the positions, if the velocities disagree or are much noisier."""
     pieces = piece_coefficients(fit.coefficients[:, None])
     trend.add_to(pieces, rows.knots)
     _, rate, acceleration = evaluate_pieces(rows.knots, pieces, rows.time, derivatives=2)[:, :, 0]
     trusted, velocity_sd = check_velocity(velocity, rate, acceleration, dof=fit.dof)
     # Information of velocities at the edge of the band, relative to positions.
     if not trusted or fit.noise_sd * fit.bandwidth / rows.knots.step < 0.3 * velocity_sd:
-        return trusted, fit
+        return fit
     weight = np.where(np.isfinite(velocity), fit.noise_sd / velocity_sd, 0.0)
     rest = position - trend.at(rows.time)[:, 0], weight * (np.nan_to_num(velocity) - trend.at(rows.time, 1)[:, 0])
     better, = smooth(rows.both(weight), np.concatenate(rest)[:, None], [fit.noise_sd], robustness=ROBUSTNESS)
-    return trusted, better
+    return better
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,6 @@ def check_velocity(velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndar
         Derivatives of the smooth curve through the positions at the same stamps.
     dof : float
         Effective number of parameters of that curve: so many of its values are independent.
-        Largest disagreement, which must be excluded by two standard errors.
 
     Returns
     -------
@@ -157,8 +156,6 @@ class JointCurve:
     """Polynomials between the knots, shape (6, n_intervals, n_joints)."""
     noise_sd: np.ndarray
     """Noise of the positions, rad, shape (n_joints,): estimated from the residuals, at least the known noise of the encoder."""
-    velocity_trusted: np.ndarray
-    """Whether the velocities agree with the positions, shape (n_joints,)."""
     bandwidth: np.ndarray
     """Frequency that passes at half its amplitude, Hz, shape (n_joints,); zero for a joint at rest."""
 
@@ -216,8 +213,7 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
     floor = _noise_floor(position, noise_sd)
     trend = Trend.through(time, position, still)
     coefficients = np.zeros((knots.n_coefficients, position.shape[1]))
-    bandwidth, trusted = np.zeros(position.shape[1]), np.zeros(position.shape[1], bool)
-    noise = floor.copy()
+    bandwidth, noise = np.zeros(position.shape[1]), floor.copy()
     moving = np.flatnonzero(~still).tolist()
     if len(stamps) >= _MINIMUM_SAMPLES and len(moving):
         rows = JointRows(knots, time)
@@ -225,12 +221,11 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
         for joint, fit in zip(moving, fits, strict=True):
             noise[joint] = max(floor[joint], fit.noise_sd)
             if velocity is not None:
-                trusted[joint], fit = fit_with_velocity(rows, fit, position[:, joint], velocity=velocity[:, joint],
-                                                        trend=trend.column(joint))
+                fit = fit_with_velocity(rows, fit, position[:, joint], velocity=velocity[:, joint], trend=trend.column(joint))
             coefficients[:, joint], bandwidth[joint] = fit.coefficients, fit.bandwidth / (2 * np.pi * knots.step)
     pieces = piece_coefficients(coefficients)
     trend.add_to(pieces, knots)
-    return JointCurve(knots, pieces, noise, trusted, bandwidth)
+    return JointCurve(knots, pieces, noise, bandwidth)
 
 
 def _check(time, position):

@@ -169,44 +169,9 @@ def _times_jacobian(rows, vectors):
     return rows - one * across + two * _cross(across, vectors)
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """Navigation states at the samples."""
-
-    time: np.ndarray
-    """Seconds, shape (n,)."""
-    mat_ns: np.ndarray
-    """Attitude, sensor frame to level frame, shape (n, 3, 3)."""
-    velocity_n: np.ndarray
-    """m/s, shape (n, 3), zero at the start."""
-    position_n: np.ndarray
-    """m, shape (n, 3), zero at the start."""
-
-
-@dataclass(frozen=True, eq=False)
-class Drift:
-    """Dead-reckoning errors at the end of each stretch of a recording."""
-
-    start: np.ndarray
-    """Start of each stretch, s, shape (k,)."""
-    seconds: float
-    """Length of a stretch, s."""
-    velocity: np.ndarray
-    """Size of the velocity error at the end, m/s, shape (k,)."""
-    position: np.ndarray
-    """Size of the position error at the end, m, shape (k,)."""
-    attitude: np.ndarray
-    """Angle of the attitude error at the end, rad, shape (k,)."""
-
-    def median(self) -> tuple[float, float, float]:
-        """Return the medians over the stretches: velocity (m/s), position (m), attitude (rad)."""
-        return float(np.median(self.velocity)), float(np.median(self.position)), float(np.median(self.attitude))
-
-
-def integrate_attitude(time: np.ndarray, rate_s: np.ndarray, mat_ns0: np.ndarray | None = None, *,
-                       earth_rate_n: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+def integrate_attitude(time: np.ndarray, rate_s: np.ndarray, mat_ns0: np.ndarray | None = None) -> np.ndarray:
     """
-    Integrate the rate against inertial space into the attitude against the level frame, shape (n, 3, 3).
+    Integrate the rate into the attitude, sensor frame to level frame, shape (n, 3, 3).
 
     Each step turns by the mean of two neighbouring rates times the step, with the two-sample coning term ``rate_k x rate_(k+1) dt^2/12``.
 
@@ -215,21 +180,16 @@ def integrate_attitude(time: np.ndarray, rate_s: np.ndarray, mat_ns0: np.ndarray
     time : array, shape (n,)
         Seconds.
     rate_s : array, shape (n, 3)
-        Rate against inertial space, rad/s, sensor frame.
+        Rate relative to the level frame, rad/s, sensor frame.
     mat_ns0 : array, shape (3, 3), optional
         Attitude at the first sample, identity if not given.
-    earth_rate_n : array, shape (3,)
-        Turn of the level frame against inertial space, rad/s.
 
     """
     time, rate_s = _checked(time, rate_s)
     step = np.diff(time)[:, None]
     turns = 0.5 * (rate_s[1:] + rate_s[:-1]) * step + np.cross(rate_s[:-1], rate_s[1:]) * step**2 / 12
-    start = np.eye(3) if mat_ns0 is None else np.asarray(mat_ns0, float)
-    mat_is = np.concatenate([start[None], start @ Rotation.from_quat(_prefix_product(turns.T).T).as_matrix()])
-    if not np.any(earth_rate_n):
-        return mat_is
-    return Rotation.from_rotvec(-np.multiply.outer(time - time[0], np.asarray(earth_rate_n, float))).as_matrix() @ mat_is
+    start = np.eye(3) if mat_ns0 is None else mat_ns0
+    return np.concatenate([start[None], start @ Rotation.from_quat(_prefix_product(turns.T).T).as_matrix()])
 
 
 def dead_reckon(time: np.ndarray, force_n: np.ndarray, gravity: float) -> tuple[np.ndarray, np.ndarray]:
@@ -247,30 +207,25 @@ def dead_reckon(time: np.ndarray, force_n: np.ndarray, gravity: float) -> tuple[
     return velocity, _running_integral(time, velocity)
 
 
-def strapdown(time: np.ndarray, force_s: np.ndarray, rate_s: np.ndarray, *, gravity: float, mat_ns0: np.ndarray | None = None,
-              earth_rate_n: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Trajectory:
+def strapdown(time: np.ndarray, force_s: np.ndarray, rate_s: np.ndarray, *, gravity: float,
+              mat_ns0: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
-    Navigate by accelerometers and gyroscopes only, from rest at the origin.
+    Return velocity and position in n, m/s and m, each shape (n, 3), by accelerometers and gyroscopes only, from rest at the origin.
 
     Parameters
     ----------
     time : array, shape (n,)
         Seconds.
     force_s, rate_s : arrays, shape (n, 3)
-        Specific force, m/s^2, and rate against inertial space, rad/s, sensor frame.
+        Specific force, m/s^2, and rate relative to the level frame, rad/s, sensor frame.
     gravity : float
         Local gravity, m/s^2.
-    mat_ns0, earth_rate_n
+    mat_ns0
         As in `integrate_attitude`.
 
-    Returns
-    -------
-    Trajectory
-
     """
-    mat_ns = integrate_attitude(time, rate_s, mat_ns0, earth_rate_n=earth_rate_n)
-    velocity, position = dead_reckon(time, np.einsum('nij,nj->ni', mat_ns, force_s), gravity)
-    return Trajectory(np.asarray(time, float), mat_ns, velocity, position)
+    mat_ns = integrate_attitude(time, rate_s, mat_ns0)
+    return dead_reckon(time, np.einsum('nij,nj->ni', mat_ns, force_s), gravity)
 
 
 def error_growth(time: np.ndarray, force_error_s: np.ndarray, mat_ns: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -297,11 +252,11 @@ def largest(vectors: np.ndarray) -> np.ndarray | float:
     return np.max(np.linalg.norm(vectors, axis=-1), axis=-1)
 
 
-def drift_over(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *, seconds: float = 50.0) -> Drift:
+def dead_reckoning_errors(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the dead-reckoning error of measured or compensated samples over stretches of a recording.
+    Return the errors of velocity and position in n of measured or compensated samples, m/s and m, each shape (n, 3).
 
-    Each stretch starts at rest from the true attitude. The reference's own samples are integrated by the same rule and subtracted, so
+    Navigation starts at rest from the true attitude. The reference's own samples are integrated by the same rule and subtracted, so
     that only sensor errors remain.
 
     Parameters
@@ -309,35 +264,12 @@ def drift_over(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *,
     reference : Reference
         True motion at the same stamps.
     force_s, rate_s : arrays, shape (n, 3)
-        Samples to judge, m/s^2 and rad/s.
-    seconds : float
-        Length of a stretch; stretches follow one another without overlap.
-
-    Returns
-    -------
-    Drift
-
-    Raises
-    ------
-    InputError
-        When the recording is shorter than one stretch.
+        Measured or compensated samples, m/s^2 and rad/s.
 
     """
-    edges = np.searchsorted(reference.time, np.arange(reference.time[0], reference.time[-1] + 1e-9, seconds))
-    if len(edges) < 2:
-        length = reference.time[-1] - reference.time[0]
-        raise InputError(f'dead reckoning needs {seconds:g} s in one piece, got {length:.3g} s; request less', code='too_short')
-    ends = []
-    for first, last in zip(edges[:-1], edges[1:] + 1):
-        cut = slice(first, last)
-        start = reference.mat_sn[first].T
-        measured = strapdown(reference.time[cut], force_s[cut], rate_s[cut], gravity=reference.gravity, mat_ns0=start)
-        true = strapdown(reference.time[cut], reference.force_s[cut], reference.rate_s[cut], gravity=reference.gravity, mat_ns0=start)
-        ends.append((np.linalg.norm(measured.velocity_n[-1] - true.velocity_n[-1]),
-                     np.linalg.norm(measured.position_n[-1] - true.position_n[-1]),
-                     Rotation.from_matrix(measured.mat_ns[-1] @ true.mat_ns[-1].T).magnitude()))
-    velocity, position, attitude = np.array(ends).T
-    return Drift(reference.time[edges[:-1]], float(seconds), velocity, position, attitude)
+    measured, true = (strapdown(reference.time, force, rate, gravity=reference.gravity, mat_ns0=reference.mat_sn[0].T)
+                      for force, rate in ((force_s, rate_s), (reference.force_s, reference.rate_s)))
+    return measured[0] - true[0], measured[1] - true[1]
 
 
 def _checked(time, rate_s):

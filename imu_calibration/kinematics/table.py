@@ -127,7 +127,7 @@ class Table:
             checked['mount_xyz'] = three_numbers(self.mount_xyz, 'mount xyz')
         for name, (low, high, advice) in _NUMBERS.items():
             value = getattr(self, name)
-            checked[name] = None if value is None else finite_number(value, name, low, high=high, advice=advice)
+            checked[name] = None if value is None else finite_number(value, name, low=low, high=high, advice=advice)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         if self.gravity is None and self.latitude is None:

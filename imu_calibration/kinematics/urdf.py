@@ -100,24 +100,14 @@ def up_of(root: str, transforms: Iterable[tuple[str, str, np.ndarray]]) -> tuple
         When the frames form a circle.
 
     """
-    parents = {child: (parent, quaternion) for parent, child, quaternion in transforms}
-    up, frame, passed = np.array([0.0, 0.0, 1.0]), root, []
-    mats = []
-    while frame in parents:
-        passed.append(frame)
-        frame, quaternion = parents[frame]
-        if frame in passed:
-            raise InputError(f"static transforms must form a tree, those around '{frame}' form a circle; correct them, or give `up`",
-                             key='up', code='frame_circle')
-        mats.append(_matrix(quaternion))
-    for matrix in reversed(mats):
-        up = matrix.T @ up
-    return tuple(up.tolist())
-
-
-def _matrix(quaternion):
-    """Return the rotation matrix of a quaternion x, y, z, w of any length, shape (3, 3)."""
-    return Rotation.from_quat(quaternion).as_matrix()
+    tree = StaticTransforms()
+    for parent, child, quaternion in transforms:
+        tree.add(parent, child, xyz=(0.0, 0.0, 0.0), quaternion=quaternion)
+    frame, _, mat = tree._to_root(root)[-1]
+    if frame in tree._parents:
+        raise InputError(f"static transforms must form a tree, those around '{frame}' form a circle; correct them, or give `up`",
+                         key='up', code='frame_circle')
+    return tuple(mat[2].tolist())
 
 
 JOINT_ERRORS = {'joint_error_rad': 1e-3, 'joint_error_m': 1e-3}

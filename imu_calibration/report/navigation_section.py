@@ -12,7 +12,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.estimation.observability import _attitudes
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.rotations import Reference, lever_matrix
-from imu_calibration.kinematics.strapdown import strapdown
+from imu_calibration.kinematics.strapdown import dead_reckoning_errors, strapdown
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, draw, log_axis
 from imu_calibration.report.page import text
 
@@ -127,8 +127,7 @@ def noise_densities(result: CalibrationResult) -> list[float]:
 
 
 def _growth(time, runs):
-    return Growth(time, np.array([np.linalg.norm(run.velocity_n, axis=1) for run in runs]),
-                  np.array([np.linalg.norm(run.position_n, axis=1) for run in runs]))
+    return Growth(time, *(np.linalg.norm(errors, axis=-1) for errors in zip(*runs)))
 
 
 def motion_growth(result: CalibrationResult) -> tuple[Growth, ...] | None:
@@ -155,13 +154,11 @@ def _moving_runs(result, window, length):
     reference_c = result.calibration.model.temperature_ref_c
     temperature = np.full(len(time), reference_c) if window.temperature_c is None else window.temperature_c[some]
     corrected = compensate(result.calibration, window.force_s[some], window.rate_s[some], alpha_s=truth.alpha_s, temperature_c=temperature)
-    grid, start = np.linspace(0.0, length, RUN_INSTANTS), truth.mat_sn[0].T
-    true = strapdown(time, truth.force_s, truth.rate_s, gravity=truth.gravity, mat_ns0=start)
+    grid = np.linspace(0.0, length, RUN_INSTANTS)
     growths = []
     for force, rate in ((window.force_s[some], window.rate_s[some]), (corrected.force, corrected.rate)):
-        run = strapdown(time, force, rate, gravity=truth.gravity, mat_ns0=start)
-        errors = [np.linalg.norm(getattr(run, name) - getattr(true, name), axis=1) for name in ('velocity_n', 'position_n')]
-        growths.append(Growth(grid, *(np.interp(grid, time - time[0], error) for error in errors)))
+        errors = dead_reckoning_errors(truth, force, rate)
+        growths.append(Growth(grid, *(np.interp(grid, time - time[0], np.linalg.norm(error, axis=1)) for error in errors)))
     return growths
 
 

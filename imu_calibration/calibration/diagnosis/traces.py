@@ -10,7 +10,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import INPUT_OF, warped_reference
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.kinematics.strapdown import drift_over
+from imu_calibration.kinematics.strapdown import dead_reckoning_errors
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import StoredWindows, Window, all_samples, chunks
 from imu_calibration.selection.gain import MEASURES, OF_MODEL, Gain, reduction_interval
@@ -301,14 +301,13 @@ def _dead_reckoning(windows, spans, table, models):
         return None
     chosen = [stretches[k] for k in np.unique(np.linspace(0, len(stretches) - 1, MOST_STRETCHES).round().astype(int))]
     drifts = [_drifts([windows[k] for k in stretch], table, models) for stretch in chosen]
-    velocity, position = (np.median([[getattr(drift, name)[0] for drift in pair] for pair in drifts], axis=0) for name in
-                          ('velocity', 'position'))
+    velocity, position = np.median(drifts, axis=0).T
     return {'seconds': DEAD_RECKONING, 'position_before': float(position[0]), 'position_after': float(position[1]),
             'velocity_before': float(velocity[0]), 'velocity_after': float(velocity[1]), 'stretches': len(chosen)}
 
 
 def _drifts(windows, table, models):
-    """Return the Drift of each model over the first `DEAD_RECKONING` seconds of some windows."""
+    """Return the errors of velocity and position, m/s and m, of each model `DEAD_RECKONING` seconds after the start of some windows."""
     motion, temperature, rows = all_samples(windows)
     time, found = np.concatenate([window.time for window in windows]), []
     for model in models:
@@ -318,5 +317,7 @@ def _drifts(windows, table, models):
             matrix = model.model.value(sensor, Role.LINEAR, model.values)
             felt[sensor] = getattr(reference[sensor], INPUT_OF[sensor])[rows] + np.linalg.solve(matrix, error[sensor].T).T
         true = replace(reference['accelerometer'].select(rows), time=time, rate_s=reference['gyroscope'].rate_s[rows])
-        found.append(drift_over(true, felt['accelerometer'], felt['gyroscope'], seconds=DEAD_RECKONING))
+        some = slice(np.searchsorted(time, time[0] + DEAD_RECKONING) + 1)
+        errors = dead_reckoning_errors(true.select(some), felt['accelerometer'][some], felt['gyroscope'][some])
+        found.append([np.linalg.norm(error[-1]) for error in errors])
     return found
