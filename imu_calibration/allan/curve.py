@@ -186,25 +186,6 @@ class _Level:
                 self.counts = None
 
 
-def overlapping_allan_variance(values: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """
-    Return the overlapping Allan variance of samples in memory, shape (n_scales, n_columns).
-
-    Parameters
-    ----------
-    values : ndarray, shape (n, n_columns)
-        Readings at equal steps of time.
-    factors : ndarray of int, shape (n_scales,)
-        Samples per mean.
-
-    """
-    sums = AllanSums(factors, np.shape(values)[1])
-    for start in range(0, len(values), 65536):
-        sums.push(np.asarray(values[start:start + 65536], float))
-    sums.end_stretch()
-    return sums.variance()
-
-
 MAX_STEP_JITTER = 0.2
 """Largest typical departure of steps from the period, in periods, up to which a single step is believed."""
 STAMP_WINDOW_SAMPLES = 64

@@ -7,23 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import toeplitz
 
-from imu_calibration.allan.figures import HORIZON, SLOW_PROCESSES, AxisFigures, NoiseFigures, TrendFigure
+from imu_calibration.allan.figures import HORIZON, SLOW_PROCESSES, AxisFigures, NoiseFigures
 from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, NoiseProcess, mean_covariance
-from imu_calibration.allan.terms import TERM_DETERMINED, TERM_HELD, TERM_WEAK, TIME_KEY, Term
+from imu_calibration.allan.terms import GAUSS_MARKOV, TIME_KEY, Term
+from imu_calibration.allan.trends import AxisTrend
 from imu_calibration.core.documents import finite, from_text, to_text
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.units import NOISE_QUANTITY, STANDARD_GRAVITY, for_people, significant
 from imu_calibration.effects.base import AXES, SENSORS, UNITS
+from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK
 
 NOISE_FORMAT = 'imu_calibration/noise/1'
 NOISE_UNITS = {
-    'accelerometer': {QUANTISATION.name: 'm/s', WHITE.name: 'm/s^2/sqrt(Hz)', FLICKER.name: 'm/s^2', 'gauss_markov': 'm/s^2', TIME_KEY: 's',
+    'accelerometer': {QUANTISATION.name: 'm/s', WHITE.name: 'm/s^2/sqrt(Hz)', FLICKER.name: 'm/s^2', GAUSS_MARKOV: 'm/s^2', TIME_KEY: 's',
                       RANDOM_WALK.name: 'm/s^3/sqrt(Hz)', 'temperature': 'm/s^2/K', 'turn_on': 'm/s^2', 'ramp': 'm/s^3'},
-    'gyroscope': {QUANTISATION.name: 'rad', WHITE.name: 'rad/s/sqrt(Hz)', FLICKER.name: 'rad/s', 'gauss_markov': 'rad/s', TIME_KEY: 's',
+    'gyroscope': {QUANTISATION.name: 'rad', WHITE.name: 'rad/s/sqrt(Hz)', FLICKER.name: 'rad/s', GAUSS_MARKOV: 'rad/s', TIME_KEY: 's',
                   RANDOM_WALK.name: 'rad/s^2/sqrt(Hz)', 'temperature': 'rad/s/K', 'turn_on': 'rad/s', 'ramp': 'rad/s^2'}}
 """Unit of every figure."""
-TERMS = (QUANTISATION.name, WHITE.name, FLICKER.name, 'gauss_markov', TIME_KEY, RANDOM_WALK.name)
-STATUSES = (TERM_DETERMINED, TERM_WEAK, TERM_HELD)
+TERMS = (QUANTISATION.name, WHITE.name, FLICKER.name, GAUSS_MARKOV, TIME_KEY, RANDOM_WALK.name)
+STATUSES = (DETERMINED, WEAK, HELD)
+"""Statuses of a figure."""
 
 
 def noise_to_text(figures: NoiseFigures, horizon: float = HORIZON) -> str:
@@ -131,9 +134,9 @@ def _axis(section, k, deviation):
             raise DocumentError(f"every axis must have '{needed}', it is missing; write the noise document again", code='part_missing')
     alternatives = {name: _term(name, entry, k) for name, entry in (section.get('alternatives') or {}).items()
                     if entry['interval95'][k] is not None}
-    trends = tuple(TrendFigure(name, float(entry['value'][k]), float(entry['sd'][k]), float(entry.get('time_constant', [0, 0, 0])[k]))
+    trends = tuple(AxisTrend(name, float(entry['value'][k]), float(entry['sd'][k]), float(entry.get('time_constant', [0, 0, 0])[k]))
                    for name, entry in (section.get('taken_out') or {}).items() if entry['value'][k] is not None)
-    record_for = {name: values[k] for name, values in (section.get('record_for') or {}).items() if terms[name].status != TERM_DETERMINED}
+    record_for = {name: values[k] for name, values in (section.get('record_for') or {}).items() if terms[name].status != DETERMINED}
     others = tuple(tuple(form) for form in section['also_possible'][k])
     return AxisFigures(terms, tuple(section['slow_part'][k]), others, alternatives, float(section['shortest_averaging_time'][k]),
                        float(section['excess'][k]), _pair((section.get('oscillation') or [None] * 3)[k]),
@@ -151,7 +154,7 @@ def _term(name, entry, k):
     if status not in STATUSES or len(interval) != 2 or not 0 <= interval[0] <= interval[1]:
         raise DocumentError(f"'{name}' must have a status ({', '.join(STATUSES)}) and an interval of two numbers in rising order, got "
                             f'{status!r} and {list(interval)}; write the noise document again', code='status_or_interval')
-    if (value is None) != (status == TERM_HELD) or (value is not None and not np.isfinite(float(value))):
+    if (value is None) != (status == HELD) or (value is not None and not np.isfinite(float(value))):
         raise DocumentError(f"'{name}' must have a finite value unless it is held, got {value!r} and '{status}'; "
                             'write the noise document again', code='value_missing')
     return Term(name, None if value is None else float(value), interval, status, str((entry.get('reason') or [''] * 3)[k]))
@@ -207,7 +210,7 @@ def position_sd(processes: Sequence[NoiseProcess], coefficients: Sequence[float]
 
 
 TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bias_instability': 'bias instability B',
-          'gauss_markov': 'Gauss–Markov σ', TIME_KEY: 'correlation time τ', 'random_walk': 'random walk K',
+          GAUSS_MARKOV: 'Gauss–Markov σ', TIME_KEY: 'correlation time τ', 'random_walk': 'random walk K',
           'temperature': 'follows the temperature', 'turn_on': 'settles after turn-on', 'ramp': 'drifts steadily'}
 BASIS = {'walk': 'as found', 'equivalent': 'equivalent of the slow noise', 'bound': 'none detected: upper limit'}
 NO_BOUND = 'no bound'
@@ -293,19 +296,19 @@ def duration(seconds: float) -> str:
 def requested(axis: AxisFigures) -> list[Term]:
     """Return the figures of an axis that count: white noise and the slow part, or the random walk where no slow part is seen."""
     names = [WHITE.name, *(axis.form or (RANDOM_WALK.name,))]
-    return [axis.terms[name] for name in [*names, *([TIME_KEY] if 'gauss_markov' in names else [])]]
+    return [axis.terms[name] for name in [*names, *([TIME_KEY] if GAUSS_MARKOV in names else [])]]
 
 
 def counts(figures: NoiseFigures) -> dict[str, int]:
     """Return how many of the figures that count are determined, weak and held."""
     statuses = [term.status for sensor in SENSORS for axis in figures.sensor(sensor) for term in requested(axis)]
-    return {status: statuses.count(status) for status in (TERM_DETERMINED, TERM_WEAK, TERM_HELD)}
+    return {status: statuses.count(status) for status in STATUSES}
 
 
 def exit_code(figures: NoiseFigures) -> int:
     """Return 0 when every required figure is determined and no sample was lost, else 3."""
     found = counts(figures)
-    return 3 if found[TERM_WEAK] or found[TERM_HELD] or figures.recording.get('dropped') else 0
+    return 3 if found[WEAK] or found[HELD] or figures.recording.get('dropped') else 0
 
 
 def lines(figures: NoiseFigures) -> list[str]:

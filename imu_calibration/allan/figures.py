@@ -5,35 +5,22 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, NoiseProcess, allan_variance, gauss_markov
-from imu_calibration.allan.terms import TIME_KEY, AxisNoise
+from imu_calibration.allan.terms import GAUSS_MARKOV, PROCESSES, TIME_KEY, AxisNoise
+from imu_calibration.allan.trends import AxisTrend
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import BiasProcess
 
 HORIZON = 100.0
 """s; for a filter with white noise and a random walk only: the walk has the same Allan variance at this averaging time."""
-SLOW_PROCESSES = (FLICKER.name, RANDOM_WALK.name, 'gauss_markov')
-
-
-@dataclass(frozen=True)
-class TrendFigure:
-    """A trend that was subtracted from an axis before its noise was estimated."""
-
-    name: str
-    """'temperature', 'turn_on' or 'ramp'."""
-    value: float
-    """Per kelvin, size at the beginning, or per second."""
-    sd: float
-    """Standard deviation."""
-    time: float = 0.0
-    """Time constant of turn-on, s."""
+SLOW_PROCESSES = (FLICKER.name, RANDOM_WALK.name, GAUSS_MARKOV)
 
 
 @dataclass(frozen=True, eq=False)
 class AxisFigures(AxisNoise):
     """The noise of one axis of a recording."""
 
-    trends: tuple[TrendFigure, ...] = ()
-    """Subtracted trends."""
+    trends: tuple[AxisTrend, ...] = ()
+    """Trends that were subtracted before the noise was estimated."""
     record_for: dict[str, float | None] = field(default_factory=dict)
     """Name of a figure that is not determined -> seconds of rest that would do, None: more than two days of it."""
     sample_sd: float = 0.0
@@ -51,9 +38,9 @@ class AxisFigures(AxisNoise):
         return found
 
     def _process(self, name):
-        if name == 'gauss_markov':
+        if name == GAUSS_MARKOV:
             return gauss_markov(self.terms[TIME_KEY].value or self.terms[TIME_KEY].interval[0])
-        return {process.name: process for process in (QUANTISATION, WHITE, FLICKER, RANDOM_WALK)}[name]
+        return PROCESSES[name]
 
     @property
     def white(self) -> float:
@@ -153,7 +140,7 @@ def _processes(axes):
     variances = {time: flicker * np.log(PROCESS_TIME_RATIO) / np.pi for time in PROCESS_TIMES}
     variances[PROCESS_TIMES[-1]] += walk * PROCESS_TIMES[-1] / 2.0
     for axis in axes:
-        if 'gauss_markov' in axis:
-            process, coefficient = axis['gauss_markov']
+        if GAUSS_MARKOV in axis:
+            process, coefficient = axis[GAUSS_MARKOV]
             variances[process.time] = variances.get(process.time, 0.0) + share * coefficient
     return tuple(BiasProcess(float(np.sqrt(variance)), float(time)) for time, variance in sorted(variances.items()) if variance > 0)

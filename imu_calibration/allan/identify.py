@@ -7,17 +7,18 @@ import numpy as np
 
 from imu_calibration import __version__
 from imu_calibration.allan.curve import AllanCurve, Detrending, RestReader, averaging_factors
-from imu_calibration.allan.figures import AxisFigures, NoiseFigures, TrendFigure
+from imu_calibration.allan.figures import AxisFigures, NoiseFigures
 from imu_calibration.allan.moment_fit import Moments, Whitener
 from imu_calibration.allan.processes import RANDOM_WALK, WHITE, NoiseProcess, ScaleCovariance
-from imu_calibration.allan.still_parts import LeftOut, StillPart, Survey, still_parts, survey
-from imu_calibration.allan.terms import LEAST_SCALES, PROCESSES, TERM_DETERMINED, AxisNoise, identify_axis
+from imu_calibration.allan.still_parts import LEFT_OUT, StillPart, Survey, still_parts, survey
+from imu_calibration.allan.terms import LEAST_SCALES, PROCESSES, AxisNoise, identify_axis
 from imu_calibration.allan.trends import MAX_TREND_BLOCKS, AxisTrend, Blocks, TrendSearch
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import reported
 from imu_calibration.core.samples import NominalScaling, SampleBlock
 from imu_calibration.effects.base import AXES, SENSORS
+from imu_calibration.estimation.solution import DETERMINED
 
 CYCLES = 64
 """Cycles of the hump's frequency in a segment: a resonance of quality below 16 is wider than the neighbouring ordinates of the test."""
@@ -162,8 +163,8 @@ class RestingRecord:
     """Trends subtracted from each axis."""
     parts: tuple[StillPart, ...]
     """Stretches at rest."""
-    left_out: LeftOut
-    """Seconds that were not at rest."""
+    left_out: dict[str, float]
+    """Reason (`LEFT_OUT`) -> seconds that were not used."""
     sample_sd: np.ndarray
     """Standard deviation of single samples within a quarter of a second, shape (6,)."""
     survey: Survey
@@ -214,7 +215,7 @@ def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScali
     """Read a recording twice, first for parts at rest and trends, then for the Allan curves; arguments as for `identify_noise`."""
     found = survey(source(), nominal)
     pieces = [still_parts(chunks, found.period) for chunks in found.epochs]
-    parts, left_out = [part for part, _ in pieces], _joined([left for _, left in pieces])
+    parts, left_out = [part for part, _ in pieces], {reason: sum(left[reason] for _, left in pieces) for reason in LEFT_OUT}
     seconds = sum(part.seconds for of_epoch in parts for part in of_epoch)
     if seconds < MIN_CURVE_SAMPLES * found.period or not found.period:
         raise InputError(f'the IMU must rest for at least {MIN_CURVE_SAMPLES} samples, it rested for {seconds:.1f} s; '
@@ -244,21 +245,18 @@ def _require_scatter(curve):
 
 def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:
     """Return what is written to noise.yaml: the figures of all axes and the excluded parts."""
-    record, left = result.record, result.record.left_out
-    times = RecordingTimes(record.curve.period)
+    record, times = result.record, RecordingTimes(result.record.curve.period)
     axes = [_axis_figures(record, k, axis, times) for k, axis in enumerate(result.axes)]
     recording = {'seconds_at_rest': float(record.curve.seconds), 'parts': len(record.parts),
                  'longest_part': float(max(part.seconds for part in record.parts)),
-                 'left_out': {'motion': left.motion, 'short_rests': left.short, 'other_sampling_rate': left.other_rate},
-                 'dropped': dict(record.survey.dropped),
+                 'left_out': record.left_out, 'dropped': dict(record.survey.dropped),
                  'intervals_hold_for': 'this recording; the slow noise of another one can be outside'}
     return NoiseFigures(tuple(axes[:3]), tuple(axes[3:]), 1.0 / record.curve.period, record.survey.frame_id, recording,
                         tuple(float(tau) for tau in record.curve.tau), {'software': f'imu_calibration {__version__}'} | (provenance or {}))
 
 
 def _axis_figures(record, k, axis, times):
-    trends = tuple(TrendFigure(trend.name, trend.coefficient, trend.sd, trend.time) for trend in record.trends[k])
-    return AxisFigures(**vars(axis), trends=trends, record_for=_record_for(axis, times), sample_sd=float(record.sample_sd[k]),
+    return AxisFigures(**vars(axis), trends=record.trends[k], record_for=_record_for(axis, times), sample_sd=float(record.sample_sd[k]),
                        deviation=tuple(float(v) for v in np.sqrt(record.curve.variance[:, k])))
 
 
@@ -267,7 +265,7 @@ def _record_for(axis, times):
     found = {}
     for name, term in axis.terms.items():
         asked = name in (WHITE.name, RANDOM_WALK.name, *axis.form)
-        if term.status == TERM_DETERMINED or not asked or name not in PROCESSES or not np.isfinite(term.interval[1]):
+        if term.status == DETERMINED or not asked or name not in PROCESSES or not np.isfinite(term.interval[1]):
             continue
         processes, coefficients = list(axis.fit.processes), list(axis.fit.coefficients)
         if name not in axis.fit.names:
@@ -278,10 +276,6 @@ def _record_for(axis, times):
         some = [j for j in range(len(processes)) if coefficients[j] > 0]
         found[name] = times.needed(tuple(processes[j] for j in some), np.array([coefficients[j] for j in some]), some.index(index))
     return found
-
-
-def _joined(left):
-    return LeftOut(*(sum(getattr(item, name) for item in left) for name in LeftOut.__dataclass_fields__))
 
 
 class _Clock:

@@ -50,21 +50,13 @@ class StillPart:
         return (self.end_ns - self.first_ns) * 1e-9
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """The parts of a recording that were not at rest."""
-
-    motion: float = 0.0
-    """Seconds with motion, and around it."""
-    short: float = 0.0
-    """Seconds at rest in pieces too short to be used."""
-    other_rate: float = 0.0
-    """Seconds sampled at another rate."""
+LEFT_OUT = ('motion', 'short_rests', 'other_sampling_rate')
+"""Reasons for which seconds are not used: motion and the time around it, pieces too short, another sampling rate."""
 
 
-def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], LeftOut]:
+def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], dict[str, float]]:
     """
-    Return the parts at rest and the excluded parts.
+    Return the parts at rest, and the seconds that were left out for each reason of `LEFT_OUT`.
 
     Parameters
     ----------
@@ -87,7 +79,7 @@ def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], LeftOut
         else:
             short += part.seconds
     moved = float(np.sum(~inner & same)) * seconds
-    return parts, LeftOut(moved, short, float(np.sum(~same)) * seconds)
+    return parts, dict(zip(LEFT_OUT, (moved, short, float(np.sum(~same)) * seconds)))
 
 
 def _at_the_usual_rate(chunks, period):

@@ -17,10 +17,10 @@ from imu_calibration.allan.moment_fit import (
     time_interval,
 )
 from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, gauss_markov
+from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK
 
 GAUSS_MARKOV = 'gauss_markov'
-FORMS = ((), ('random_walk',), ('bias_instability',), ('gauss_markov',), ('bias_instability', 'random_walk'),
-         ('random_walk', 'gauss_markov'))
+FORMS = ((), (RANDOM_WALK.name,), (FLICKER.name,), (GAUSS_MARKOV,), (FLICKER.name, RANDOM_WALK.name), (RANDOM_WALK.name, GAUSS_MARKOV))
 """Slow parts that are tried, a Gauss-Markov process last."""
 PROCESSES = {process.name: process for process in (QUANTISATION, WHITE, FLICKER, RANDOM_WALK)}
 MAX_COST_EXCESS = 6.0
@@ -165,7 +165,6 @@ def without_finest(moments: Moments, count: int) -> Moments:
     return replace(moments, used=used)
 
 
-TERM_DETERMINED, TERM_WEAK, TERM_HELD = 'determined', 'weak', 'held'
 DETERMINED_RATIO = 1.6
 """Upper over lower end of the 95 % interval up to which a figure counts as determined: a quarter to either side."""
 MISFIT_P_VALUE = 1e-3
@@ -181,7 +180,7 @@ FILTER_TIME_RATIO = 8.0
 TIME_KEY = 'correlation_time'
 PEAK, PEAK_HEIGHT = 0.371, 0.525
 """Where the Allan variance of a sine peaks, in periods, and how high, in squared amplitudes."""
-RICHEST = tuple((QUANTISATION.name, WHITE.name, *form) for form in ((FLICKER.name, RANDOM_WALK.name), (RANDOM_WALK.name, GAUSS_MARKOV)))
+RICHEST = tuple((QUANTISATION.name, WHITE.name, *form) for form in FORMS[-2:])
 """Models that explain a curve if any does."""
 
 
@@ -325,15 +324,14 @@ def _figures(choice, name, excess):
 def _term(name, value, interval):
     lower, upper = (float(end) for end in interval)
     if not value > 0:
-        return Term(name, None, (0.0, upper), TERM_HELD, 'not seen')
+        return Term(name, None, (0.0, upper), HELD, 'not seen')
     if lower > 0 and upper / lower <= DETERMINED_RATIO:
-        return Term(name, float(value), (lower, upper), TERM_DETERMINED)
-    return Term(name, float(value), (lower, upper), TERM_WEAK, 'too short' if lower > 0 else 'may be none')
+        return Term(name, float(value), (lower, upper), DETERMINED)
+    return Term(name, float(value), (lower, upper), WEAK, 'too short' if lower > 0 else 'may be none')
 
 
 def _held(term):
-    return replace(term, value=None, status=TERM_HELD, interval=(0.0, term.interval[1]),
-                   reason='not seen')
+    return replace(term, value=None, status=HELD, interval=(0.0, term.interval[1]), reason='not seen')
 
 
 def _doubted(terms, best, rivals):
@@ -341,8 +339,8 @@ def _doubted(terms, best, rivals):
     doubted = {}
     for name, term in terms.items():
         without = [rival.form for rival in rivals if name in best.form and name not in rival.form]
-        if without and term.status == TERM_DETERMINED:
+        if without and term.status == DETERMINED:
             other = ' and '.join(without[0]).replace('_', ' ')
-            term = replace(term, status=TERM_WEAK, reason=f'{other} fits too')
+            term = replace(term, status=WEAK, reason=f'{other} fits too')
         doubted[name] = term
     return doubted

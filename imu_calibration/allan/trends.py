@@ -41,16 +41,16 @@ class AxisTrend:
 
     name: str
     """'temperature', 'turn_on' or 'ramp'."""
-    coefficient: float
-    """Per kelvin, or the size at the beginning, or per second."""
+    value: float
+    """Coefficient per kelvin, size at the beginning, or slope per second."""
     sd: float
-    """Standard deviation of the coefficient."""
+    """Standard deviation of the value."""
     time: float = 0.0
     """Time constant of turn-on, s."""
 
     def at(self, time: np.ndarray, temperature_c: np.ndarray | None, reference: 'TrendReference') -> np.ndarray:
         """Return the trend at instants (s since the beginning), shape (n,)."""
-        return self.coefficient * shape_of(self.name, self.time)(time, temperature_c, reference)
+        return self.value * shape_of(self.name, self.time)(time, temperature_c, reference)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ class StaticTransforms:
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}
 
-    def add(self, parent: str, child: str, *, xyz: Sequence[float], quaternion: Sequence[float]) -> bool:
+    def add(self, parent: str, child: str, *, xyz: Sequence[float], quaternion: Sequence[float] | np.ndarray) -> bool:
         """
         Add the pose of a child frame in its parent: translation in m, quaternion (x, y, z, w).
 

@@ -8,9 +8,10 @@ from imu_calibration.allan.document import position_budget
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification
 from imu_calibration.allan.processes import FLATNESS, FLICKER, RANDOM_WALK, WHITE
-from imu_calibration.allan.terms import TERM_DETERMINED, TERM_HELD, TERM_WEAK, predicted
+from imu_calibration.allan.terms import predicted
 from imu_calibration.core.units import NOISE_QUANTITY, for_people
 from imu_calibration.effects.base import SENSORS, UNITS
+from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK
 from imu_calibration.report.figures import AXIS_COLOURS, FAINT, GREY, MARKER, Drawn, draw, log_axis
 from imu_calibration.report.page import render, text, tile
 
@@ -91,8 +92,8 @@ RATES = (50.0, 100.0, 200.0, 400.0, 1000.0)
 def noise_report(result: NoiseIdentification, figures: NoiseFigures, horizon: float = HORIZON) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
     found = document.counts(figures)
-    word = 'good' if not found[TERM_WEAK] and not found[TERM_HELD] else 'weak'
-    headline = f'{found[TERM_DETERMINED]} of {sum(found.values())} figures determined'
+    word = 'good' if not found[WEAK] and not found[HELD] else 'weak'
+    headline = f'{found[DETERMINED]} of {sum(found.values())} figures determined'
     first, *rest = document.lines(figures)
     return render('noise.html', title='Noise of an IMU', headline=headline, word=word, first=first, lines=rest, facts=_facts(figures),
                   tiles=_tiles(figures, horizon), tables=_tables(figures),

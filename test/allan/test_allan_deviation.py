@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from imu_calibration.allan.curve import FULL, AllanSums, SampleGrid, averaging_factors, overlapping_allan_variance, spread
+from imu_calibration.allan.curve import FULL, AllanSums, SampleGrid, averaging_factors, spread
+
+from worlds.noise_worlds import overlapping_allan_variance
 
 PERIOD = 0.01
 

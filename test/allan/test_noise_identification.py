@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from imu_calibration.allan.curve import averaging_factors, overlapping_allan_variance
+from imu_calibration.allan.curve import averaging_factors
 from imu_calibration.allan.document import position_sd
 from imu_calibration.allan.identify import RecordingTimes
 from imu_calibration.allan.moment_fit import RIDGE, Moments, pearson_tails
@@ -25,9 +25,6 @@ from imu_calibration.allan.processes import (
 )
 from imu_calibration.allan.terms import (
     PROCESSES,
-    TERM_DETERMINED,
-    TERM_HELD,
-    TERM_WEAK,
     TIME_KEY,
     Choice,
     choose_form,
@@ -37,8 +34,9 @@ from imu_calibration.allan.terms import (
     log_cost,
     without_finest,
 )
+from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK
 
-from worlds.noise_worlds import FORMS, AxisTruth, draw_truth, flicker, random_walk
+from worlds.noise_worlds import FORMS, AxisTruth, draw_truth, flicker, overlapping_allan_variance, random_walk
 
 PERIOD = 0.02
 ALL = (QUANTISATION, WHITE, FLICKER, RANDOM_WALK, gauss_markov(3.0))
@@ -152,15 +150,15 @@ def test_a_long_record_determines_its_noise():
     for name, value in figures.items():
         term = found.terms[name]
         assert term.interval[0] < value < term.interval[1] and term.interval[0] < term.value < term.interval[1]
-    assert found.terms['white_noise'].status == TERM_DETERMINED
-    assert found.terms['bias_instability'].status == TERM_HELD and found.terms['bias_instability'].value is None
+    assert found.terms['white_noise'].status == DETERMINED
+    assert found.terms['bias_instability'].status == HELD and found.terms['bias_instability'].value is None
 
 
 def test_ten_minutes_cannot_determine_a_small_random_walk():
     figures = {'white_noise': 1.0, 'random_walk': 0.003}
     found = identify_axis(moments_of(figures, 600.0, 1))
     term = found.terms['random_walk']
-    assert term.status == TERM_HELD and term.value is None and term.interval[0] == 0.0 and term.interval[1] > 0.003
+    assert term.status == HELD and term.value is None and term.interval[0] == 0.0 and term.interval[1] > 0.003
     assert term.reason == 'not seen'
     needed = RecordingTimes(PERIOD).needed((WHITE, RANDOM_WALK), np.array([1.0, 0.003**2]), 1)
     # the walk crosses the noise after N sqrt(3) / K = 580 s; some fifty of these, as a walk of 0.05 needs half an hour
@@ -172,7 +170,7 @@ def test_the_predicted_recording_time_is_what_a_fit_says_of_itself():
     """The interval of a fit on the average curve of a record of the predicted length just meets the criterion."""
     figures = {'white_noise': 1.0, 'random_walk': 0.05}
     length = RecordingTimes(PERIOD).needed((WHITE, RANDOM_WALK), np.array([1.0, 0.05**2]), 1)
-    for seconds, status in ((length, TERM_DETERMINED), (length / 3, TERM_WEAK)):
+    for seconds, status in ((length, DETERMINED), (length / 3, WEAK)):
         term = identify_axis(expected_moments(figures, seconds)).terms['random_walk']
         ratio = term.interval[1] / term.interval[0]
         assert term.status == status, (seconds, ratio)
@@ -184,7 +182,7 @@ def test_a_form_that_explains_the_curve_as_well_makes_a_figure_weak():
     for seed in range(3):
         found = identify_axis(moments_of({'white_noise': 1.0, 'bias_instability': 0.15}, 900.0, seed))
         ambiguous += bool(found.others)
-        assert all(found.terms[name].status != TERM_DETERMINED for form in found.others for name in found.form if name not in form)
+        assert all(found.terms[name].status != DETERMINED for form in found.others for name in found.form if name not in form)
     assert ambiguous
 
 
@@ -305,7 +303,7 @@ def test_white_noise_that_is_not_seen_is_held_with_its_bound():
     step = 8 / np.sqrt(period)
     walk = random_walk(36_000, period, 0.3, rng)
     term = identify_axis(moments_from(np.round((walk + 0.3 * step) / step) * step, period)).terms['white_noise']
-    assert (term.status, term.value, term.interval[0]) == (TERM_HELD, None, 0.0) and 0 < term.interval[1] < 2
+    assert (term.status, term.value, term.interval[0]) == (HELD, None, 0.0) and 0 < term.interval[1] < 2
 
 
 def test_the_longest_of_many_rests_keeps_its_own_scales():

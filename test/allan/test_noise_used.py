@@ -13,7 +13,7 @@ from test_live_calibration import blocks
 from imu_calibration.allan.document import noise_to_text, position_budget
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures, bias_processes
 from imu_calibration.allan.processes import FLICKER, RANDOM_WALK, allan_variance, gauss_markov
-from imu_calibration.allan.terms import TERM_DETERMINED, TERM_HELD, TIME_KEY, Term
+from imu_calibration.allan.terms import TIME_KEY, Term
 from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.calibration.live_poses import LiveByHand
@@ -27,6 +27,7 @@ from imu_calibration.document.trust import with_measured_noise
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.noise_search import estimate_offsets
+from imu_calibration.estimation.solution import DETERMINED, HELD
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.adoption import CompensatorSettings, adopt
 from imu_calibration.references.options import CalibrationOptions
@@ -44,8 +45,8 @@ BAG = Path(__file__).parents[2] / 'bags' / 'sample_session'
 
 def axis_of(**figures):
     """An axis with these figures, nothing else."""
-    terms = {name: Term(name, value, (0.9 * value, 1.1 * value), TERM_DETERMINED) for name, value in figures.items()}
-    terms.setdefault('random_walk', Term('random_walk', None, (0.0, 1e-9), TERM_HELD))
+    terms = {name: Term(name, value, (0.9 * value, 1.1 * value), DETERMINED) for name, value in figures.items()}
+    terms.setdefault('random_walk', Term('random_walk', None, (0.0, 1e-9), HELD))
     form = tuple(name for name in figures if name not in ('white_noise', TIME_KEY))
     return AxisFigures(terms, form)
 
@@ -205,6 +206,6 @@ def test_white_noise_that_may_be_none_counts_with_its_bound():
 def test_an_axis_that_allows_any_walk_is_not_the_worst():
     """A vibration can hide a walk of any size; filters want a number, which the other axes have."""
     open_end = axis_of(white_noise=1e-4)
-    open_end.terms['random_walk'] = Term('random_walk', None, (0.0, np.inf), TERM_HELD)
+    open_end.terms['random_walk'] = Term('random_walk', None, (0.0, np.inf), HELD)
     axes = (open_end, axis_of(white_noise=1e-4), axis_of(white_noise=1e-4))
     assert NoiseFigures(axes, axes, 100.0).densities('gyroscope').walk == 1e-9

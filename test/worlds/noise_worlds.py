@@ -7,6 +7,7 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len
 from scipy.signal import lfilter
 
+from imu_calibration.allan.curve import AllanSums
 from imu_calibration.simulation.sensor_noise import GRADES
 
 RATE = 100.0
@@ -83,6 +84,14 @@ class AxisTruth:
         if 'quantisation' in f:
             values += quantisation(n, period, f['quantisation'], rng)
         return values
+
+
+def overlapping_allan_variance(values, factors):
+    """Return the overlapping Allan variance of samples in memory, shape (n_scales, n_columns)."""
+    sums = AllanSums(factors, values.shape[1])
+    sums.push(values)
+    sums.end_stretch()
+    return sums.variance()
 
 
 FORMS = (('random_walk',), ('bias_instability',), ('gauss_markov',), ('bias_instability', 'random_walk'))
