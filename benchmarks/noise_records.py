@@ -19,7 +19,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
-from imu_calibration.allan.curve import averaging_factors, overlapping_allan_variance  # noqa: E402
+from imu_calibration.allan.curve import averaging_factors  # noqa: E402
 from imu_calibration.allan.moment_fit import Moments, Whitener  # noqa: E402
 from imu_calibration.allan.processes import (  # noqa: E402
     ScaleCovariance,  # noqa: E402
@@ -30,7 +30,7 @@ from imu_calibration.allan.terms import PROCESSES, TIME_KEY, fit_form, identify_
 from imu_calibration.effects.base import SENSORS  # noqa: E402
 from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402
 
-from worlds.noise_worlds import FORMS, RATE, draw_truth  # noqa: E402
+from worlds.noise_worlds import FORMS, RATE, draw_truth, overlapping_allan_variance  # noqa: E402
 
 LENGTHS = {'10 min': 600.0, '1 h': 3600.0, '3 h': 10800.0}
 NAMES = {'white_noise': 'white noise N', 'random_walk': 'random walk K', 'bias_instability': 'bias instability B', 'gauss_markov': 'Gauss–Markov σ',

@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.compensation.compensate import FittedErrors
 from imu_calibration.compensation.stream import CompensationStream
-from imu_calibration.kinematics.strapdown import drift_over
+from imu_calibration.kinematics.strapdown import dead_reckoning_errors
 from imu_calibration.preprocessing.window_finder import SessionTruth
 
 
@@ -33,9 +33,12 @@ def error_figures(truth: SessionTruth, force_s: np.ndarray, rate_s: np.ndarray, 
     reference = truth.reference
     period = float(np.median(np.diff(reference.time)))
     length = max(int(round(1.0 / period)), 1)
-    drift = drift_over(reference, force_s, rate_s, seconds=seconds)
+    edges = np.searchsorted(reference.time, np.arange(reference.time[0], reference.time[-1] + 1e-9, seconds))
+    ends = [[np.linalg.norm(errors[-1]) for errors in dead_reckoning_errors(reference.select(part), force_s[part], rate_s[part])]
+            for part in map(slice, edges[:-1], edges[1:] + 1)]
+    velocity, position = np.median(ends, axis=0)
     return ErrorFigures(_rms_of_means(force_s - reference.force_s, length), _rms_of_means(rate_s - reference.rate_s, length),
-                        float(np.median(drift.velocity)), float(np.median(drift.position)))
+                        float(velocity), float(position))
 
 
 def _rms_of_means(error, length):
