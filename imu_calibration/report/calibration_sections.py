@@ -1,118 +1,22 @@
-"""Sections of the page of a calibration: origin, proof, error budget, observability, readings at rest."""
+"""The page of a calibration, and its sections with figures: observability, error budget, readings at rest."""
 
-from functools import singledispatch
 from typing import Any
 
 import numpy as np
 
+from imu_calibration.calibration.installation_angles import AXIS_PAIRS, derive, in_paper_units
 from imu_calibration.calibration.result import CalibrationResult, WindowErrors
-from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.settings import describe
-from imu_calibration.core.units import error_text, for_people
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.decision import harmed, ratio_text
+from imu_calibration.document.decision import harmed
 from imu_calibration.document.trust import usage
 from imu_calibration.effects.base import PREFIXES, SENSORS
-from imu_calibration.estimation.solution import DETERMINED
-from imu_calibration.papers.zhang2017 import axis_readings
+from imu_calibration.papers.zhang2017 import AxisReading, axis_readings
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.report.figures import AFTER, GREY, INK, STATUS, derived_section, draw, lever_section, log_axis
+from imu_calibration.report.figures import AFTER, GREY, INK, STATUS, draw, lever_figure, log_axis
 from imu_calibration.report.navigation_section import navigation_section
-from imu_calibration.report.page import fixed, in_unit, parameter_groups, render, text, tile
-from imu_calibration.report.residuals import draw_windows, residual_section
-
-
-def recording_facts(result: CalibrationResult) -> list[tuple[str, str]]:
-    """Return (item, value) of the recording, for the head of the page."""
-    calibration, conditions = result.calibration, result.calibration.conditions
-    bags = calibration.provenance.get('bags') or []
-    facts = [('recording', ', '.join(bag['name'] for bag in bags) or 'not named'),
-             ('date', str(conditions.get('date') or 'unknown').replace('T', ' ').replace('Z', ' UTC')),
-             ('length', _duration(conditions.get('duration_s'))), ('frame', calibration.frame_id or 'not named'),
-             ('reference', result.reference)]
-    facts += [(name, str(calibration.provenance[name])) for name in ('serial', 'operator') if calibration.provenance.get(name)]
-    if conditions.get('largest_rate'):
-        facts.append(('fastest turn', in_unit(conditions['largest_rate'], 'rad/s')))
-    if conditions.get('temperature_range_c'):
-        facts.append(('temperature', ' to '.join(fixed(t, 1) for t in conditions['temperature_range_c']) + ' °C'))
-    return facts
-
-
-def _duration(seconds):
-    if seconds is None:
-        return 'unknown'
-    minutes, rest = divmod(round(seconds), 60)
-    return f'{minutes} min {rest} s' if minutes else f'{rest} s'
-
-
-def origin_section(result: CalibrationResult) -> dict[str, Any]:
-    """Return the tables of windows, drops, settings, table description and provenance."""
-    calibration, statistics = result.calibration, result.calibration.statistics
-    used = [(kind, count, (statistics.get('samples_used') or {}).get(kind, ''))
-            for kind, count in (statistics.get('windows') or {}).items()]
-    stream = statistics.get('stream') or {}
-    kept_out = [(reason, count) for reason, count in stream.items() if reason not in dict(statistics.get('windows') or {}) and count]
-    bags = [(bag['name'], bag['sha256']) for bag in calibration.provenance.get('bags') or []]
-    return {'windows': used, 'kept_out': kept_out, 'dropped': list((statistics.get('dropped') or {}).items()),
-            'warnings': [found['text'] for found in statistics.get('preflight') or []], 'settings': _settings(result.options),
-            'table': table_rows(result), 'bags': bags, 'software': calibration.provenance.get('software', ''), 'gauge': calibration.gauge,
-            'model': [(sensor, ' + '.join(getattr(calibration.model, sensor)) or 'nothing')
-                      for sensor in ('accelerometer', 'gyroscope', 'reference')]}
-
-
-def _settings(options):
-    """Return (name, value, unit, meaning, whether it was changed) of the settings in force."""
-    options = options or CalibrationOptions()
-    values = [(item, getattr(options.windows, item.name)) for item in describe(options.windows)]
-    return [(item.name, text(value), item.unit, item.text, value != item.default) for item, value in values]
-
-
-def _joint(joint):
-    said = [f'{"turns about" if joint.turns else "slides along"} ({", ".join(text(a) for a in joint.axis)})']
-    if any(joint.xyz):
-        said.append(f'at ({", ".join(text(a) for a in joint.xyz)}) m')
-    if any(joint.rpy_deg):
-        said.append(f'turned by roll, pitch, yaw ({", ".join(text(a) for a in joint.rpy_deg)})°')
-    if joint.mimic is not None:
-        said.append(f'follows {joint.mimic.joint} times {text(joint.mimic.multiplier)}')
-    return ', '.join(said)
-
-
-@singledispatch
-def table_rows(_result: CalibrationResult) -> list[tuple[str, ...]]:
-    """Return (item, value) of the table; empty for a calibration without a table."""
-    return []
-
-
-@table_rows.register
-def _(result: TableResult):
-    table = result.table
-    rows = [(f'joint {joint.name}', _joint(joint)) for joint in table.joints]
-    if table.joint_error_rad or table.joint_error_m:
-        rows.append(('joints may be off by', ' and '.join(in_unit(value, unit) for value, unit in (
-            (table.joint_error_rad, 'rad'), (table.joint_error_m, 'm')) if value) + ' (sd)'))
-    rows += [('up', f'({", ".join(text(a) for a in table.up)})'),
-             ('gravity', f'{fixed(table.gravity_value, 5)} m/s²' + (' as given' if table.gravity is not None else ', WGS 84 normal gravity')
-              + (f', sd {text(table.gravity_sd_value)} m/s²' if table.gravity_sd_value else ''))]
-    rows.append(('place', 'not given: Earth rate is estimated' if table.latitude is None
-                 else f'latitude {text(table.latitude, 5)}°'
-                 + (f', azimuth {text(table.azimuth_deg, 4)}°' if table.azimuth_deg is not None else ', azimuth not given')))
-    rows.append(('mount', f'roll, pitch, yaw ({", ".join(text(a) for a in table.mount_rpy_deg)})°'
-                 + ('; place not given' if table.mount_xyz is None else f'; at ({", ".join(text(a) for a in table.mount_xyz)}) m')))
-    return rows
-
-
-def proof_section(calibration: Calibration) -> list[dict[str, str | bool]]:
-    """Return a row for each sensor and motion: 'sensor', 'motion', 'much', 'before', 'after', 'ratio', 'bad'; empty without a proof."""
-    rows = []
-    for sensor, found in calibration.proof.items():
-        worse = harmed(found)
-        for motion, part in (('all', found), *(found.get('regimes') or {}).items()):
-            before, after = (error_text(part[name], part.get('unit', found['unit'])) for name in ('before', 'after'))
-            much = f'{part["seconds"]:.0f} s' if 'seconds' in part else f'{found["windows"]}'
-            rows.append({'sensor': sensor, 'motion': motion, 'much': much, 'before': before, 'after': after,
-                         'ratio': ratio_text(part), 'bad': motion in worse})
-    return rows
+from imu_calibration.report.page import render
+from imu_calibration.report.residuals import draw_windows, residual_figure
 
 
 ROW = 0.155
@@ -130,20 +34,15 @@ def observability_section(result: CalibrationResult) -> dict[str, Any]:
     if len(result.singular_values):
         figures['singular'] = draw('singular', (8.6, 2.5), _stems, result.singular_values,
                                    label='Singular values of the design in units of the tolerances')
-    return {**figures, 'directions': directions(calibration), 'strongest': strongest(calibration, live)}
+    return {**figures, 'strongest': strongest(calibration, live)}
 
 
-def directions(calibration: Calibration) -> list[list[tuple[str, str]]]:
-    """Return the weak directions: (parameter, weight) of each."""
-    return [[(name, text(weight, 2)) for name, weight in d['parameters'].items()] for d in calibration.undetermined]
-
-
-def strongest(calibration: Calibration, live: np.ndarray, count: int = 5) -> list[tuple[str, str, str]]:
+def strongest(calibration: Calibration, live: np.ndarray, count: int = 5) -> list[tuple[str, str, float]]:
     """Return the strongest correlations as (name, name, value)."""
     correlation, names = _correlation(calibration, live)
     rows, columns = np.triu_indices(len(names), 1)
     order = np.argsort(-np.abs(correlation[rows, columns]), kind='stable')[:count]
-    return [(names[rows[k]], names[columns[k]], text(correlation[rows[k], columns[k]], 2)) for k in order]
+    return [(names[rows[k]], names[columns[k]], correlation[rows[k], columns[k]]) for k in order]
 
 
 def _correlation(calibration, live):
@@ -225,32 +124,19 @@ MIN_DRAWN_SHARE = 1e-5
 
 
 def budget_section(result: CalibrationResult) -> dict[str, Any]:
-    """Return the figure, the rows (largest component of each effect) and the assumptions."""
+    """Return the figure, the budget, and the terms of the reported variances; the sds of the effects' largest components, by cause and term."""
     budget = result.error_budget()
     terms = {name: np.sqrt(np.maximum(variance, 0.0)) for name, variance in result.calibration.covariance_terms.items()
              if np.any(variance > 0)}
-    return {'figure': draw('budget', (8.6, 0.9 + 0.26 * len(_effects(result))), _dots, result, budget,
-                           label='Error budget of each effect by cause, in tolerances'),
-            'causes': list(budget.causes), 'texts': [(cause, budget.texts[cause]) for cause in budget.causes],
-            'rows': _rows(result, list(budget.causes.values()), budget.total), 'terms': list(terms),
-            'term_rows': _rows(result, list(terms.values()), result.calibration.sd)}
+    figure = draw('budget', (8.6, 0.9 + 0.26 * len(_effects(result))), _dots, result, budget,
+                  label='Error budget of each effect by cause, in tolerances')
+    return {'figure': figure, 'texts': budget.texts, 'effects': _effects(result), 'tolerances': result.tolerances,
+            'tables': (('cause', {**budget.causes, 'total': budget.total}), ('term', {**terms, 'total': result.calibration.sd}))}
 
 
 def _effects(result):
     model = result.calibration.model
     return [(e, model.slices[e.key]) for e in model.effects if np.any(result.calibration.sd[model.slices[e.key]] > 0)]
-
-
-def _rows(result, causes, total):
-    """Return a row per effect: the sd of its largest component by cause, and the total."""
-    rows = []
-    for effect, part in _effects(result):
-        factor, unit = for_people(effect.unit_of(0), effect.sensor)
-        parts = [*causes, total]
-        rows.append({'name': f'{effect.sensor} {effect.name.replace("_", " ")}', 'unit': '' if unit == '1' else unit,
-                     'cells': [text(float(p[part].max()) * factor, 2) if p[part].max() > 1e-15 else '0' for p in parts],
-                     'tolerance': text(result.tolerances[part][0] * factor, 2)})
-    return rows
 
 
 def _dots(figure, result, budget):
@@ -279,28 +165,14 @@ LEVEL_FORCE_SHARE = 0.02
 """Windows with a mean specific force further than this share from 1 g turn through the vertical and have no reading at 1 g."""
 
 
-def reading_tables(result: CalibrationResult, errors: WindowErrors) -> list[list[dict[str, Any]]]:
-    """Return two lists of lines: at rest (Table 2) and in rotation (Table 4)."""
+def reading_tables(result: CalibrationResult, errors: WindowErrors) -> list[list[AxisReading]]:
+    """Return the readings at rest (Table 2) and in rotation (Table 4), of three sensors in each position."""
     gravity = result.gravity
     true = errors.true['accelerometer']
     chosen = (np.abs(np.linalg.norm(true, axis=1) / gravity - 1) < LEVEL_FORCE_SHARE) & (errors.kind != 'dynamic')
-    lines = axis_readings(errors.measured['accelerometer'][chosen], (true + errors.after['accelerometer'])[chosen], true[chosen],
-                          rate=np.linalg.norm(errors.true['gyroscope'][chosen], axis=1), gravity=gravity)
-    return [_lines([line for line in lines if (line.rate_deg_s == 0) == at_rest]) for at_rest in (True, False)]
-
-
-def _lines(readings):
-    """Return lines of three sensors each: position, rate, and per sensor theoretical, before, after, errors in mg."""
-    lines = []
-    for first in range(0, len(readings), 3):
-        triple = readings[first:first + 3]
-        cells = [{'sensor': r.sensor, 'theory': fixed(r.theoretical_g, 5), 'before': fixed(r.before_g, 5), 'after': fixed(r.after_g, 5),
-                  'error_before': text(abs(r.before_g - r.theoretical_g) * 1e3, 3),
-                  'error_after': text(abs(r.after_g - r.theoretical_g) * 1e3, 2),
-                  'gain': text(r.improvement, 2) if np.isfinite(r.improvement) else '–'} for r in triple]
-        lines.append({'position': triple[0].position.replace('-', '−'), 'rate': text(triple[0].rate_deg_s), 'windows': triple[0].n_windows,
-                      'cells': cells})
-    return lines
+    readings = axis_readings(errors.measured['accelerometer'][chosen], (true + errors.after['accelerometer'])[chosen], true[chosen],
+                             rate=np.linalg.norm(errors.true['gyroscope'][chosen], axis=1), gravity=gravity)
+    return [[reading for reading in readings if (reading.rate_deg_s == 0) == at_rest] for at_rest in (True, False)]
 
 
 def calibration_report(result: CalibrationResult) -> str:
@@ -314,28 +186,10 @@ def calibration_report(result: CalibrationResult) -> str:
     result : CalibrationResult
 
     """
-    errors = result.window_errors()
-    at_rest, moving = reading_tables(result, errors)
-    navigation = navigation_section(result, errors)
-    return render('calibration.html', title='IMU calibration', verdict=result.verdict, usage=usage(result.calibration),
-                  facts=recording_facts(result), proof=proof_section(result.calibration), tiles=tiles(result, navigation),
-                  groups=parameter_groups(result),
-                  derived=derived_section(result), residuals=residual_section(result),
-                  errors=[draw_windows(errors, sensor) for sensor in SENSORS],
-                  observability=observability_section(result), levers=lever_section(result), navigation=navigation, at_rest=at_rest,
-                  moving=moving, budget=budget_section(result), origin=origin_section(result), observations=result.observations)
-
-
-def tiles(result: CalibrationResult, navigation: dict[str, Any]) -> list[dict[str, str | None]]:
-    """Return the main figures: the determined parameters, and the errors before and after."""
-    asked = list(result.calibration.requested.values())
-    found = [tile('parameters determined', f'{asked.count(DETERMINED)} of {len(asked)}', note='to their tolerances')]
-    for sensor, entry in result.calibration.proof.items():
-        after, before = (error_text(entry[which], entry['unit']) for which in ('after', 'before'))
-        number, _, unit = after.partition(' ')
-        found.append(tile(f'{sensor} error on held-out data', number, unit, before=before, note=f'{entry["windows"]} windows'))
-    if navigation['rest']:
-        after, before = navigation['rest']['position'][::-1]
-        found.append(tile('position error after 50 s at rest', after, 'm', before=f'{before} m',
-                          note=f"part of the calibration: {navigation['rest']['parts'][0][2]} m"))
-    return found
+    errors, windows = result.window_errors(), (result.options or CalibrationOptions()).windows
+    return render('calibration.html', title='IMU calibration', result=result, usage=usage(result.calibration), harmed=harmed,
+                  derived=[derive(result.calibration, sensor) for sensor in SENSORS], in_paper_units=in_paper_units, axis_pairs=AXIS_PAIRS,
+                  residuals=residual_figure(result),
+                  errors=[draw_windows(errors, sensor) for sensor in SENSORS], observability=observability_section(result),
+                  levers=lever_figure(result.calibration), navigation=navigation_section(result, errors), readings=reading_tables(result, errors),
+                  budget=budget_section(result), settings=[(item, getattr(windows, item.name)) for item in describe(windows)])

@@ -9,10 +9,11 @@ from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisRe
 from imu_calibration.core.units import for_people
 from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.document.verdict import judge, unexplained_text
-from imu_calibration.effects.base import AXES, SENSORS, UNITS
+from imu_calibration.effects.base import SENSORS, UNITS
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, Drawn, draw, draw_tones
 from imu_calibration.report.overlay import overlay_section, variables
-from imu_calibration.report.page import in_unit, parameter_groups, people, render, text, tile
+from imu_calibration.report.page import render
+from imu_calibration.selection.proposals import Proposal
 
 BINS = 16
 FEW = 200
@@ -33,114 +34,28 @@ def diagnosis_report(result: DiagnosisResult) -> str:
 
     """
     diagnosis = result.diagnosis
-    rests = [(sensor, rest) for sensor, rest in diagnosis.unexplained.items() if rest.significant]
-    word = 'bad' if any(rest.proposal is None for _, rest in rests) else 'weak' if rests or diagnosis.findings else 'good'
-    return render('diagnosis.html', title='IMU diagnosis', word=word, headline=_headline(diagnosis, rests),
-                  lines=_reasons(diagnosis, rests), tiles=_tiles(diagnosis),
-                  findings=[_finding(diagnosis, finding, number) for number, finding in enumerate(diagnosis.findings, 1)],
-                  formulas=[_formula(diagnosis, rest) for rest in diagnosis.unexplained.values() if rest.proposal is not None],
+    rests = {sensor: rest for sensor, rest in diagnosis.unexplained.items() if rest.significant}
+    word = 'bad' if any(rest.proposal is None for rest in rests.values()) else 'weak' if rests or diagnosis.findings else 'good'
+    return render('diagnosis.html', title='IMU diagnosis', word=word, result=result, diagnosis=diagnosis, rests=rests,
+                  draw_finding=draw_finding, draw_formula=draw_formula, formula_gain=formula_gain, unexplained_text=unexplained_text,
                   overlay=overlay_section(diagnosis.traces, diagnosis.baseline.model.joint_names, _causes(diagnosis)),
-                  candidates=[_candidate(row) for row in diagnosis.candidates],
-                  rests=[_rest(*pair) for pair in diagnosis.unexplained.items()],
-                  beyond=[f'{_capital(line)}.'
-                          for line in (*(line for pair in diagnosis.unexplained.items() for line in beyond_lines(*pair)), *result.notes)],
+                  beyond=[*(line for pair in diagnosis.unexplained.items() for line in beyond_lines(*pair)), *result.notes],
                   spectra=[drawn for pair in diagnosis.unexplained.items() if (drawn := draw_tones(*pair))],
-                  not_testable=list(diagnosis.not_testable),
                   reasons=[reason for reason in judge(result.calibration, result.tolerances).reasons
-                           if reason.word in (DECISION, PARAMETERS)],
-                  groups=parameter_groups(result), observations=result.observations, windows=diagnosis.windows, locked=diagnosis.locked,
-                  bags=result.calibration.provenance.get('bags') or [], software=result.calibration.provenance.get('software', ''))
-
-
-def _capital(line):
-    return line[0].upper() + line[1:]
-
-
-def _headline(diagnosis, rests):
-    count, formulas = len(diagnosis.findings), [rest.proposal for _, rest in rests if rest.proposal is not None]
-    unexplained = 'an unexplained residual remains' if len(formulas) < len(rests) else ''
-    if count == 0 and not formulas:
-        return 'No effect of the catalogue explains the residual' if rests else 'The model is adequate'
-    found = [f'{count} cause{"s" * (count > 1)} found'] * bool(count)
-    found += [f'a formula explains {100 * formula.share:.0f} % of the {formula.sensor} residual' for formula in formulas]
-    return _capital(', and '.join([*found, *[unexplained] * bool(unexplained)]))
-
-
-def _reasons(diagnosis, rests):
-    lines = [(in_type(finding.explanation), _next_step(finding)) for finding in diagnosis.findings]
-    if not lines and not rests:
-        lines = [(f'None of the {len(diagnosis.candidates)} effects under test explains more than noise.', '')]
-    for sensor, rest in rests:
-        if rest.proposal is not None:
-            rms = in_unit(rest.rms, rest.unit or UNITS[sensor])
-            lines.append((f'{rms} rms of the {sensor} residual match no effect of the catalogue; they follow '
-                          f'{" and ".join(rest.proposal.columns)}.', f'to confirm the formula: {rest.proposal.motion}'))
-            continue
-        more = f', correlated with {rest.correlates_with}' if rest.correlates_with else ''
-        lines.append((f'{unexplained_text(sensor, rest.rms, rest.unit)}{more}.',
-                      'check the mount and the joints for a knock or slip, and causes outside the catalogue'))
-    return lines
-
-
-def _next_step(finding):
-    if finding.implausible:
-        return 'the extended calibration.yaml is without it: name it in the model where you expect it, with this size'
-    if not finding.indistinguishable_from:
-        return 'the extended calibration.yaml contains it'
-    others = ', '.join(name.replace('_', ' ') for name in finding.indistinguishable_from)
-    return f'this recording does not separate it from {others}; to separate them: {finding.separating_motion}'
-
-
-def _tiles(diagnosis):
-    tiles = [tile('effects tested', str(len(diagnosis.candidates)), note=f'{len(diagnosis.not_testable)} more could not be tested')]
-    if diagnosis.findings:
-        gain = diagnosis.gain
-        number, _, unit = in_unit(gain.heldout_rms_after, UNITS[gain.sensor]).partition(' ')
-        tiles.append(tile(f'{gain.of} ({gain.sensor}, held-out {gain.measure})', number, unit,
-                          before=in_unit(gain.heldout_rms_before, UNITS[gain.sensor]), note=_reduction(gain)))
-    navigation = diagnosis.traces.dead_reckoning
-    if navigation and diagnosis.findings:
-        tiles.append(tile(f'position error after {text(navigation["seconds"], 2)} s', text(navigation['position_after']), 'm',
-                          before=f'{text(navigation["position_before"])} m',
-                          note=f'dead reckoning, runs: {navigation["stretches"]}, median'))
-    return tiles
-
-
-def _reduction(gain):
-    interval = '' if not np.all(np.isfinite(gain.ci95)) else f' (95 %: {text(100 * gain.ci95[0], 2)} to {text(100 * gain.ci95[1], 2)} %)'
-    return f'{text(100 * gain.reduction, 2)} % less{interval}'
-
-
-def _finding(diagnosis, finding, number):
-    rows = [{'name': name, 'cells': people(value, sd, unit, quantity=name), 'sigma': text(abs(value) / sd, 2) if sd > 0 else '–'}
-            for name, (value, sd, unit) in finding.parameters.items()]
-    return {'number': number, 'title': finding.effect.replace('_', ' '), 'rows': rows,
-            'p': chance(finding.p_value), **_gained(finding.gain), 'mates': [n.replace('_', ' ') for n in finding.indistinguishable_from],
-            'implausible': finding.implausible, 'figure': draw_finding(diagnosis, finding, number)}
-
-
-def _gained(gain):
-    return {'before': in_unit(gain.heldout_rms_before, UNITS[gain.sensor]), 'after': in_unit(gain.heldout_rms_after, UNITS[gain.sensor]),
-            'reduction': _reduction(gain), 'sensor': gain.sensor, 'of': gain.of, 'measure': gain.measure}
-
-
-def _formula(diagnosis, rest):
-    """Return the formula of an unexplained residual with its gain, curve, values and recommended motion."""
-    proposal = rest.proposal
-    rows = [{'name': f'{effect.name}.{axis}', 'cells': people(value, sd, effect.unit_of(k)), 'sigma': text(abs(value) / sd, 2)}
-            for effect, values, sds in zip(proposal.effects, proposal.values, proposal.sds)
-            for k, (axis, value, sd) in enumerate(zip(AXES, values, sds))]
-    against = tuple(kind for effect in proposal.effects for kind in effect.against)
-    return {'title': ' and '.join(proposal.columns), 'sentence': f'{_capital(in_type(proposal.relation))}.', 'rows': rows,
-            'p': chance(proposal.p_value), **_gained(formula_gain(rest)),
-            'figure': draw(f'formula-{proposal.sensor}', (8.6, 3.1), _against_cause, diagnosis, proposal.sensor, against,
-                           label=f'Residual against the variable of the formula, before and after: {" and ".join(proposal.columns)}')}
+                           if reason.word in (DECISION, PARAMETERS)])
 
 
 def draw_finding(diagnosis: Diagnosis, finding: Finding, number: int) -> Drawn:
     """Return the residual against the cause of a finding, before and after, as SVG."""
     label = f'Residual against the cause, before and after: {finding.effect}'
     return draw(f'finding-{number}', (8.6, 3.1), _against_cause, diagnosis, finding.gain.sensor, finding.against, label=label)
+
+
+def draw_formula(diagnosis: Diagnosis, proposal: Proposal) -> Drawn:
+    """Return the residual against the variable of a proposed formula, before and after, as SVG."""
+    against = tuple(kind for effect in proposal.effects for kind in effect.against)
+    return draw(f'formula-{proposal.sensor}', (8.6, 3.1), _against_cause, diagnosis, proposal.sensor, against,
+                label=f'Residual against the variable of the formula, before and after: {" and ".join(proposal.columns)}')
 
 
 def draw_over_time(result: DiagnosisResult) -> Drawn:
@@ -232,26 +147,3 @@ def _over_time(figure, traces, over):
         axes.set_ylim(bottom=0)
     axes.set_xlabel('time, s')
     figure.axes[0].legend(loc='upper right', markerscale=3)
-
-
-def _candidate(row):
-    return {'effect': row.effect.replace('_', ' '), 'sensor': row.sensor, 'gain': text(row.gain_alone), 'p': chance(row.p_value_alone),
-            'beside': text(row.gain_beside) if row.gain_beside is not None else '',
-            'p_beside': chance(row.p_value_beside) if row.p_value_beside is not None else '', 'verdict': row.verdict,
-            'mark': row.verdict == 'found'}
-
-
-def chance(probability: float) -> str:
-    """Return a probability as text; an underflow is not shown as zero."""
-    return text(probability, 2) if probability > 1e-99 else 'below 10⁻⁹⁹'
-
-
-def in_type(sentence: str) -> str:
-    """Return a sentence with printed signs."""
-    return sentence.replace(' +- ', ' ± ').replace(' -', ' −').replace('^2', '²').replace('^3', '³')
-
-
-def _rest(sensor, rest):
-    share = f' ({text(100 * rest.share, 2)} % of its variance)' if rest.correlates_with and rest.share else ''
-    return {'sensor': sensor, 'significant': rest.significant, 'rms': in_unit(rest.rms, rest.unit or UNITS[sensor]),
-            'sigma': text(rest.sigma, 2), 'with': (rest.correlates_with or '–') + share}

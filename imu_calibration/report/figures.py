@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.installation_angles import AXIS_PAIRS, derive, in_paper_units
-from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.compensation.compensate import arms_of
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.units import DEG, decimals
 from imu_calibration.document import files
-from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.report.page import fixed, pair, raised
+from imu_calibration.document.calibration import Calibration
+from imu_calibration.effects.base import Role
+from imu_calibration.report.page import raised
 from imu_calibration.selection.spectrum import MIN_LINE_POWER
 from imu_calibration.selection.unexplained import Unexplained
 
@@ -198,30 +196,13 @@ def _spectra(figure, tones):
 PLANES = ((0, 1), (0, 2), (1, 2))
 
 
-def derived_section(result: CalibrationResult) -> list[dict[str, Any]]:
-    """Return scale factors, angles and biases of both sensors, as rows of text."""
-    return [_derived(derive(result.calibration, sensor), result.options.nominal) for sensor in SENSORS]
-
-
-def _derived(found, nominal):
-    angles = [[' ± '.join(pair(v / DEG, s / DEG)) for v, s in zip(*rows)] for rows in zip(found.angles, found.angles_sd)]
-    between = [('xyz'[i] + '–' + 'xyz'[j], ' ± '.join(pair(v / DEG, s / DEG)))
-               for (i, j), v, s in zip(AXIS_PAIRS, found.between, found.between_sd)]
-    lines = [{'what': what, 'unit': unit, 'values': [' ± '.join(pair(v, s)) for v, s in zip(values, sds)]}
-             for what, unit, values, sds in in_paper_units(found, nominal)]
-    ppm = [fixed((v - 1) * 1e6, decimals(max(s, 1e-12) * 1e6)) for v, s in zip(found.scale, found.scale_sd)]
-    return {'sensor': found.sensor, 'lines': lines, 'ppm': ppm, 'angles': angles, 'between': between}
-
-
-def lever_section(result: CalibrationResult) -> dict[str, Any] | None:
+def lever_figure(calibration: Calibration) -> Drawn | None:
     """Return the drawing of the lever arms, or None when the model has none."""
-    if result.calibration.of('accelerometer', Role.ARMS) is None:
+    if calibration.of('accelerometer', Role.ARMS) is None:
         return None
-    gauge = result.calibration.gauge.get('origin')
-    origin = 'the mean of the three sensitive points' if gauge == 'mean_of_sensitive_points' else 'the reference point of the mount'
-    calibration, part = result.calibration, result.calibration.model.part('accelerometer', Role.ARMS)
-    return {'figure': draw('lever-arms', (8.6, 3.15), _views, arms_of(calibration) * 1e3, calibration.covariance[part, part] * 1e6,
-                           label='Sensitive points of the three accelerometers in three views'), 'origin': origin}
+    part = calibration.model.part('accelerometer', Role.ARMS)
+    return draw('lever-arms', (8.6, 3.15), _views, arms_of(calibration) * 1e3, calibration.covariance[part, part] * 1e6,
+                label='Sensitive points of the three accelerometers in three views')
 
 
 def _views(figure, arms, cov):

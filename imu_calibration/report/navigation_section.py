@@ -14,7 +14,6 @@ from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.strapdown import dead_reckoning_errors, strapdown
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, draw, log_axis
-from imu_calibration.report.page import text
 
 REST_RUN_SECONDS = 50.0
 """Length of the runs at rest, the papers' own."""
@@ -41,24 +40,18 @@ class Growth:
 
 
 def navigation_section(result: CalibrationResult, errors: WindowErrors) -> dict[str, Any]:
-    """Return figures and end values of dead reckoning at rest and in motion."""
+    """Return figures and end values of dead reckoning at rest and in motion, None without it."""
     before, moving = rest_growth(errors), motion_growth(result)
-    found = {'rest': None, 'moving': None}
-    if before is not None:
-        after, parts = expected_growth(result, errors)
-        rows = [(name, *(text(v) for v in part.last())) for name, part in parts.items()]
-        found['rest'] = _shown('rest', before, after, parts) | {'parts': rows}
-    if moving is not None:
-        found['moving'] = _shown('moving', *moving)
-    return found
+    return {'rest': None if before is None else _shown('rest', before, *expected_growth(result, errors)),
+            'moving': None if moving is None else _shown('moving', *moving, {})}
 
 
-def _shown(name, before, after, parts=None):
-    (velocity_before, position_before), (velocity_after, position_after) = before.last(), after.last()
-    return {'figure': draw(f'growth-{name}', (8.6, 2.9), _growths, before, after, parts or {},
+def _shown(name, before, after, parts):
+    """Return the figure, and (velocity, position) at the end before, after and of each part of the error."""
+    return {'figure': draw(f'growth-{name}', (8.6, 2.9), _growths, before, after, parts,
                            label='Growth of velocity and position errors, before and after calibration'),
-            'seconds': text(before.time[-1]), 'runs': len(before.velocity), 'velocity': (text(velocity_before), text(velocity_after)),
-            'position': (text(position_before), text(position_after))}
+            'seconds': before.time[-1], 'runs': len(before.velocity), 'before': before.last(), 'after': after.last(),
+            'parts': {label: part.last() for label, part in parts.items()}}
 
 
 def rest_growth(errors: WindowErrors) -> Growth | None:

@@ -9,7 +9,6 @@ import numpy as np
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.core.units import STANDARD_GRAVITY, for_people
 from imu_calibration.effects.base import AXES, SENSORS, UNITS
-from imu_calibration.report.page import text
 
 MOST_POINTS = 1200
 """Points of a chart against a variable."""
@@ -71,8 +70,7 @@ def _sensor(traces, sensor, against, first):
                 **{when: density[w, :, k] * factor for w, when in enumerate(WHEN)}, 'noise': noise[:, k] * factor}, kind='log'))
     row(f'Histogram of the residual, {unit}', lambda k: _histogram(f'{sensor} {AXES[k]}', unit, {
         when: getattr(traces, when)[sensor][:, k] * factor for when in WHEN}))
-    bands = [{'band': name, 'cells': [f'{text(rms[0, k] * factor)} → {text(rms[1, k] * factor)}' for k in range(3)],
-              'noise': text(float(np.sqrt(np.mean(noise**2))) * factor)}
+    bands = [(name, rms.T * factor, float(np.sqrt(np.mean(noise**2))) * factor)
              for name, rms, noise in (traces.distances[sensor].bands() if sensor in traces.distances else ())]
     return {'sensor': sensor, 'unit': unit, 'bands': bands, 'rows': rows}
 

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.hand_step import HandStep, direction_words
-from imu_calibration.core.units import for_people
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.rotations import align
 from imu_calibration.planning.motion_library import MotionKind
 from imu_calibration.planning.planner import Plan
 from imu_calibration.report.figures import AXIS_COLOURS, FAINT, GREY, INK, Drawn, draw, log_axis
-from imu_calibration.report.page import render, text, tile
+from imu_calibration.report.page import render
 
 HALF_EDGES = np.array([1.0, 0.7, 0.3])
 """Half edges of the box along x, y, z: all different, so that attitudes are distinguishable."""
@@ -122,61 +121,9 @@ def _progress(figure, plan):
                       fontsize=8)
 
 
-SAYS = {MotionKind.POSE: 'rest', MotionKind.RETURN: 'return', MotionKind.SPIN: 'spin', MotionKind.SWING: 'swing',
-        MotionKind.TOGETHER: 'joint turn', MotionKind.MOVE: 'move'}
-"""Unit of the count, in the singular."""
-
-
 def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
-    by_hand, count, bound = plan.start is None, int(plan.wanted.sum()), plan.lower_bound_seconds
-    met = int((plan.sd <= plan.tolerances * (1 + 1e-6))[plan.wanted].sum())
-    tiles = [tile('time', text(plan.seconds), 's', note=f'{len(plan.motions)} {plan.noun}'),
-             tile('within tolerance', f'{met} of {count}', note='parameters')]
-    if not by_hand:
-        tiles.insert(1, tile('least time', text(bound), 's', note='lower bound for plans of these motions') if np.isfinite(bound) else
-                     tile('least time', 'not worked out'))
-    sense = 'do the steps in this order, each by the turn that is named' if by_hand else _kinds(plan)
-    if plan.missing:
-        sense = f'out of reach {plan.scope}: {", ".join(plan.missing)}'
-    what = plan.told_apart if plan.told_apart and not plan.missing else ''
-    rows = [{'until': str(number) if by_hand else f'{end:.1f}', 'kind': str(motion.kind), 'words': motion.words}
-            for number, (motion, end) in enumerate(zip(plan.motions, plan.ends, strict=True), start=1)]
-    return render('plan.html', title='Plan of a calibration', groups=_groups(plan), word='weak' if plan.missing else 'good', sense=sense,
-                  headline=f'{what} separated after {text(plan.seconds)} s' if what else
-                  f'{met} of {count} parameters within tolerance after {text(plan.seconds)} s', tiles=tiles,
-                  facts=[(str(name).replace('_', ' '), value) for name, value in provenance.items()],
-                  motion=draw_steps(plan.motions) if by_hand else draw_motion(plan), caption=HAND_CAPTION if by_hand else CAPTION,
-                  reading=READING[:1] if by_hand else READING, count='step' if by_hand else 'until, s', progress=draw_progress(plan),
-                  rows=rows)
-
-
-HAND_CAPTION = 'The IMU as a box, x its longest side, z its thinnest; as it is held at the end of each step.'
-CAPTION = ('Positions of the joints; the band above shows the kind of motion. Angles of endless joints are drawn within one turn.')
-READING = ('The standard deviations are those that a calibration of this motion will report, from the same columns, windows and noise. The '
-           'biases wander according to the grade or the noise file: therefore long rests are rare and returns are frequent.',
-           'The least time is a lower bound: information is counted as if the biases of different windows were independent, and '
-           'motions as if fractions of them and moves of zero length were possible. No plan made of the same motions '
-           'is shorter.')
-
-
-def _kinds(plan):
-    counts = {kind: sum(motion.kind is kind for motion in plan.motions) for kind in SAYS}
-    return ', '.join(f'{count} {SAYS[kind]}{"s" if count > 1 else ""}' for kind, count in counts.items() if count) or 'nothing to do'
-
-
-def _groups(plan):
-    """Return the predicted standard deviations of the parameters of each effect, in common units."""
-    sd, tolerances = plan.sd, plan.tolerances
-    places = {name: k for k, name in enumerate(plan.model.param_names) if plan.wanted[k]}
-    groups = []
-    for effect in plan.model.effects:
-        names = [name for name in effect.param_names() if name in places]
-        factor, unit = for_people(effect.unit_of(0), effect.sensor)
-        rows = [{'name': name, 'component': name.split('.')[-1], 'sd': text(factor * sd[places[name]]),
-                 'tolerance': text(factor * tolerances[places[name]]), 'share': text(sd[places[name]] / tolerances[places[name]], 2),
-                 'bar': min(100, round(100 * float(sd[places[name]] / tolerances[places[name]]))),
-                 'status': 'determined' if sd[places[name]] <= tolerances[places[name]] * (1 + 1e-6) else 'weak'} for name in names]
-        if rows:
-            groups.append({'title': f'{effect.sensor}: {effect.name}', 'unit': unit, 'rows': rows})
-    return groups
+    within = plan.sd <= plan.tolerances * (1 + 1e-6)
+    return render('plan.html', title='Plan of a calibration', plan=plan, within=within, met=int(within[plan.wanted].sum()),
+                  count=int(plan.wanted.sum()), provenance=provenance, progress=draw_progress(plan),
+                  motion=draw_steps(plan.motions) if plan.start is None else draw_motion(plan))

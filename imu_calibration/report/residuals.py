@@ -1,28 +1,22 @@
-"""Residuals: windows before and after calibration with the noise floor, their autocorrelation, chi-square, noise and wander."""
-
-from typing import Any
+"""Figures of the residuals: windows before and after calibration with the noise floor, and their autocorrelation."""
 
 import numpy as np
 
 from imu_calibration.calibration.result import CalibrationResult, WindowErrors
 from imu_calibration.core.units import for_people
-from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS, UNITS
 from imu_calibration.report.figures import AXIS_COLOURS, GREY, MARKER, Drawn, axis_legend, draw
-from imu_calibration.report.page import in_unit, text
 
 LAG_SECONDS = 2.0
 """Longest lag that is drawn."""
 MOST_WINDOWS = 60
-KIND_TEXT = {'means': 'window means', 'static': 'at rest', 'spin': 'within spins', 'dynamic': 'within dynamic stretches'}
 
 
-def residual_section(result: CalibrationResult) -> dict[str, Any]:
-    """Return figures and tables of the residuals."""
-    traces = autocorrelation(result)
-    lags = draw('autocorrelation', (8.6, 2.7), _autocorrelations, traces,
-                label='Autocorrelation of the residuals within moving windows') if traces else None
-    return {'autocorrelation': lags, 'noise': noise_rows(result.calibration), 'chi2': chi2_rows(result.calibration)}
+def residual_figure(result: CalibrationResult) -> Drawn | None:
+    """Return the autocorrelation of the residuals as SVG; None without moving windows."""
+    if not (traces := autocorrelation(result)):
+        return None
+    return draw('autocorrelation', (8.6, 2.7), _autocorrelations, traces, label='Autocorrelation of the residuals within moving windows')
 
 
 def draw_windows(errors: WindowErrors, sensor: str) -> Drawn:
@@ -96,26 +90,3 @@ def _autocorrelations(figure, traces):
         axes.set_xlabel('lag, s')
     panels[0].set_ylabel('autocorrelation')
     axis_legend(panels[-1])
-
-
-def noise_rows(calibration: Calibration) -> list[dict[str, Any]]:
-    """Return one row per sensor: noise of a sample, factor at low frequency, scatter between windows, wander."""
-    rows = []
-    for sensor in SENSORS:
-        found, unit = calibration.statistics.get(sensor, {}), UNITS[sensor]
-        white = np.asarray(found.get('noise_sd', [np.nan] * 3), float)
-        wander = found.get('wander_sd') or 0.0
-        factor, name = for_people(unit)
-        rows.append({'sensor': sensor, 'noise': ', '.join(text(v * factor) for v in white) + f' {name}',
-                     'factor': [text(v, 2) for v in found.get('low_frequency_factor', [])],
-                     'between': in_unit(found.get('between_window_sd', 0.0), unit, 2) if found.get('between_window_sd') else 'none seen',
-                     'wander': f'{in_unit(wander, unit, 2)} over {text(found.get("wander_time_s"), 2)} s' if wander else 'none seen',
-                     'moving': in_unit(found['residual_rms_moving'], unit) if found.get('residual_rms_moving') is not None else '–'})
-    return rows
-
-
-def chi2_rows(calibration: Calibration) -> list[dict[str, Any]]:
-    """Return chi-square per degree of freedom by kind of window, one row per kind."""
-    found = {sensor: calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {} for sensor in SENSORS}
-    kinds = list(dict.fromkeys(kind for sensor in SENSORS for kind in found[sensor]))
-    return [{'kind': KIND_TEXT.get(kind, kind), 'values': [text(found[sensor].get(kind)) for sensor in SENSORS]} for kind in kinds]

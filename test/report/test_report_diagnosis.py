@@ -19,7 +19,8 @@ from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.report.diagnosis_page import cause_of, chance, diagnosis_report, draw_finding, explained_share, variables
+from imu_calibration.report.diagnosis_page import cause_of, diagnosis_report, draw_finding, explained_share, variables
+from imu_calibration.report.page import chance
 from imu_calibration.selection.proposals import Proposal
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
