@@ -18,7 +18,6 @@ from imu_calibration.report.navigation_section import navigation_section
 from imu_calibration.report.page import render
 from imu_calibration.report.residuals import draw_windows, residual_figure
 
-
 ROW = 0.155
 """Height of one bar, inches."""
 
@@ -124,7 +123,7 @@ MIN_DRAWN_SHARE = 1e-5
 
 
 def budget_section(result: CalibrationResult) -> dict[str, Any]:
-    """Return the figure, the budget, and the terms of the reported variances; the sds of the effects' largest components, by cause and term."""
+    """Return the figure, and the standard deviations of the parameters by cause and by term of the reported variances."""
     budget = result.error_budget()
     terms = {name: np.sqrt(np.maximum(variance, 0.0)) for name, variance in result.calibration.covariance_terms.items()
              if np.any(variance > 0)}
@@ -189,7 +188,7 @@ def calibration_report(result: CalibrationResult) -> str:
     errors, windows = result.window_errors(), (result.options or CalibrationOptions()).windows
     return render('calibration.html', title='IMU calibration', result=result, usage=usage(result.calibration), harmed=harmed,
                   derived=[derive(result.calibration, sensor) for sensor in SENSORS], in_paper_units=in_paper_units, axis_pairs=AXIS_PAIRS,
-                  residuals=residual_figure(result),
-                  errors=[draw_windows(errors, sensor) for sensor in SENSORS], observability=observability_section(result),
-                  levers=lever_figure(result.calibration), navigation=navigation_section(result, errors), readings=reading_tables(result, errors),
-                  budget=budget_section(result), settings=[(item, getattr(windows, item.name)) for item in describe(windows)])
+                  residuals=residual_figure(result), errors=[draw_windows(errors, sensor) for sensor in SENSORS],
+                  observability=observability_section(result), levers=lever_figure(result.calibration),
+                  navigation=navigation_section(result, errors), readings=reading_tables(result, errors), budget=budget_section(result),
+                  settings=[(item, getattr(windows, item.name)) for item in describe(windows)])

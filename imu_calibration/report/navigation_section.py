@@ -123,7 +123,7 @@ def _growth(time, runs):
     return Growth(time, *(np.linalg.norm(errors, axis=-1) for errors in zip(*runs)))
 
 
-def motion_growth(result: CalibrationResult) -> tuple[Growth, ...] | None:
+def motion_growth(result: CalibrationResult) -> tuple[Growth, Growth] | None:
     """
     Return (before, after) Growth over the moving stretches of the recording, each from rest at the true attitude, or None.
 
@@ -135,8 +135,9 @@ def motion_growth(result: CalibrationResult) -> tuple[Growth, ...] | None:
     length = min(w.time[-1] - w.time[0] for w in windows)
     pairs = [_moving_runs(result, window, length) for window in windows]
     grid = np.linspace(0.0, length, RUN_INSTANTS)
-    return tuple(Growth(grid, *(np.array([getattr(pair[k], name) for pair in pairs]) for name in ('velocity', 'position')))
-                 for k in range(2))
+    before, after = (Growth(grid, *(np.array([getattr(pair[k], name) for pair in pairs]) for name in ('velocity', 'position')))
+                     for k in range(2))
+    return before, after
 
 
 def _moving_runs(result, window, length):
