@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, formula_gain
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult, beyond_lines
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult, beyond_lines, timing_lines
 from imu_calibration.core.units import for_people
 from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.document.verdict import judge, unexplained_text
@@ -39,7 +39,8 @@ def diagnosis_report(result: DiagnosisResult) -> str:
     return render('diagnosis.html', title='IMU diagnosis', word=word, result=result, diagnosis=diagnosis, rests=rests,
                   draw_finding=draw_finding, draw_formula=draw_formula, formula_gain=formula_gain, unexplained_text=unexplained_text,
                   overlay=overlay_section(diagnosis.traces, diagnosis.baseline.model.joint_names, _causes(diagnosis)),
-                  beyond=[*(line for pair in diagnosis.unexplained.items() for line in beyond_lines(*pair)), *result.notes],
+                  beyond=[*timing_lines(diagnosis), *(line for pair in diagnosis.unexplained.items() for line in beyond_lines(*pair)),
+                          *result.notes],
                   spectra=[drawn for pair in diagnosis.unexplained.items() if (drawn := draw_tones(*pair))],
                   reasons=[reason for reason in judge(result.calibration, result.tolerances).reasons
                            if reason.word in (DECISION, PARAMETERS)])

@@ -19,6 +19,7 @@ from imu_calibration.selection.regimes import RestRegime, find_regimes
 from imu_calibration.selection.residual_blocks import RestBlocks, rest_blocks
 from imu_calibration.selection.residual_fit import BlockFits
 from imu_calibration.selection.spectrum import find_tones
+from imu_calibration.selection.stamp_jitter import StampJitter
 from imu_calibration.selection.unexplained import Unexplained, beyond_noise, unexplained
 
 MIN_FORMULA_SDS = 10.0
@@ -94,6 +95,11 @@ class ResidualAnalysis(Investigation):
         tones = find_tones(self, self.table, [proposal for sensor in self.rests if (proposal := self.proposal(sensor)) is not None])
         return {sensor: self._unexplained(sensor, replace(rest, tones=tones[sensor])) for sensor, rest in self.rests.items()}
 
+    @cached_property
+    def stamp_jitter(self) -> StampJitter:
+        """Errors of the stamps from the scatter in motion."""
+        return next(iter(self.blocks.values())).jitter
+
     def _unexplained(self, sensor, rest):
         proposal = self.proposal(sensor)
         regimes = self.regimes(sensor, formula=self.columns(sensor, proposal))
@@ -110,7 +116,7 @@ class ResidualAnalysis(Investigation):
 
     def released(self) -> dict[str, Unexplained]:
         """Return `unexplained` and free the blocks and their fits, which are computed again on demand: solutions need that memory."""
-        found = self.unexplained
+        found, _ = self.unexplained, self.stamp_jitter
         self.__dict__.pop('blocks', None)
         self._fits.clear()
         return found

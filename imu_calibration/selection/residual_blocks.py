@@ -20,6 +20,7 @@ from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.noise_beside_effects import natural_processes
 from imu_calibration.selection.questions import TEMPERATURE_SPAN
 from imu_calibration.selection.saturation import measured
+from imu_calibration.selection.stamp_jitter import StampJitter, stamp_jitter, without_jitter
 from imu_calibration.simulation.session import predict_windows
 
 MIN_BLOCK_SECONDS = 0.25
@@ -61,9 +62,14 @@ class RestBlocks:
     processes: tuple
     """How every bias moves (BiasProcess)."""
     rough: np.ndarray
-    """Variance of the residual within a block by second differences, which suppress causes that vary with the motion, shape (b, 3)."""
+    """
+    Variance of the residual within a block by second differences, which suppress causes that vary with the motion, without errors of the
+    stamps, shape (b, 3).
+    """
     freedom: np.ndarray
     """Its degrees of freedom, shape (b,)."""
+    jitter: StampJitter
+    """Errors of the stamps, the same for both sensors."""
 
     @property
     def warms(self) -> bool:
@@ -132,7 +138,12 @@ def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProb
     references = References(problem.recording.model, table, motion, temperature_c=temperature)
     columns_of = _block_means(problem, table, motion, temperature, common['starts'])
     found, edges = {}, np.concatenate([part.edges[:-1] + first for part, first in zip(parts, np.cumsum([0, *map(len, windows[:-1])]))])
-    for sensor, residual in residuals(windows, table, problem.recording.model, values=problem.recording.values).items():
+    left = residuals(windows, table, problem.recording.model, values=problem.recording.values)
+    rough = {sensor: _roughness(residual, windows, edges, least=LEAST_NOISE[sensor]) for sensor, residual in left.items()}
+    slope = {sensor: _slope(residual, windows, edges, sensor) for sensor, residual in left.items()}
+    freedom = _freedom(windows, edges)
+    jitter = stamp_jitter(list(rough.values()), list(slope.values()), freedom)
+    for sensor, residual in left.items():
         mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
         floor = explained.floor.noise[sensor]
         busier = _busier(windows, sensor, floor, problem.recording.kind[which], ~problem.locked[which])
@@ -142,19 +153,39 @@ def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProb
         rows = np.concatenate([columns_of[sensor], mean], axis=1)
         design = tuple(rows @ join for join in problem.space.join[sensor])
         found[sensor] = RestBlocks(sensor, references.at(sensor), **common, design=design, index=tuple(problem.space.index[sensor]),
-                                   variance=variance, processes=processes,
-                                   **_roughness(residual, windows, edges, least=LEAST_NOISE[sensor]))
+                                   variance=variance, processes=processes, freedom=freedom,
+                                   rough=without_jitter(rough[sensor], slope[sensor], jitter.sd), jitter=jitter)
     return found
 
 
 def _roughness(residual, windows, edges, least):
-    """Return the variance by second differences in blocks that begin at the samples `edges`, at least rounding, and its freedom."""
-    inner, ends = np.ones(len(residual)), np.cumsum([len(window) for window in windows])
-    inner[ends - 1] = inner[np.append(0, ends[:-1])] = 0.0
+    """Return the variance by second differences in blocks that begin at the samples `edges`, at least rounding, shape (b, 3)."""
+    inner = _inner(windows)
     bends = np.diff(residual, 2, axis=0, prepend=residual[:1], append=residual[-1:])
-    number = np.add.reduceat(inner, edges)
     squares = np.add.reduceat(inner[:, None] * bends**2, edges, axis=0) / WHITE_BENDS
-    return {'rough': np.maximum(squares / np.maximum(number, 1)[:, None], least**2), 'freedom': number / PER_FREEDOM}
+    return np.maximum(squares / np.maximum(np.add.reduceat(inner, edges), 1)[:, None], least**2)
+
+
+def _inner(windows):
+    """Return 1 for samples with two neighbours in their window, 0 for its ends, shape (n,)."""
+    inner, ends = np.ones(sum(map(len, windows))), np.cumsum([len(window) for window in windows])
+    inner[ends - 1] = inner[np.append(0, ends[:-1])] = 0.0
+    return inner
+
+
+def _freedom(windows, edges):
+    """Return the degrees of freedom of `_roughness`, shape (b,)."""
+    return np.add.reduceat(_inner(windows), edges) / PER_FREEDOM
+
+
+def _slope(residual, windows, edges, sensor):
+    """Return the mean square of the rate of change of the predicted output in blocks that begin at the samples `edges`, shape (b, 3)."""
+    ends, squares = np.cumsum([0, *map(len, windows)]), np.zeros_like(residual)
+    for window, first in zip(windows, ends):
+        if len(window) > 2:
+            part = slice(first, first + len(window))
+            squares[part] = np.gradient(measured(window, sensor) - residual[part], window.time, axis=0)**2
+    return np.add.reduceat(squares, edges, axis=0) / np.diff(np.append(edges, len(residual)))[:, None]
 
 
 def _some(windows, length):

@@ -98,6 +98,8 @@ class Diagnosis:
     """`traces.Traces`: residuals before and after, for plots; None during a live session."""
     onset: Any = None
     """Parameters that change at one moment (`selection.onset.Onset`), or None; the findings are those of the longer part."""
+    stamp_jitter: Any = None
+    """Errors of the stamps from the scatter in motion (`selection.stamp_jitter.StampJitter`); None by hand."""
 
     @property
     def model(self) -> SensorModel:
@@ -135,6 +137,7 @@ def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
         'format': DIAGNOSIS_FORMAT,
         'baseline': {sensor: _baseline(diagnosis.baseline, sensor) for sensor in SENSORS},
         'onset': None if diagnosis.onset is None else diagnosis.onset.to_mapping(),
+        'stamp_jitter_s': diagnosis.stamp_jitter.sd if diagnosis.stamp_jitter and diagnosis.stamp_jitter.significant else None,
         'findings': [_finding(finding) for finding in diagnosis.findings],
         'gain': _gain(diagnosis.gain) if diagnosis.findings else None,
         'dead_reckoning': diagnosis.traces.dead_reckoning,

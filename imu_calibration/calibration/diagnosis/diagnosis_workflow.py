@@ -27,7 +27,6 @@ from imu_calibration.preprocessing.window import StoredWindows
 from imu_calibration.references.gravity.model_selection import too_few_poses
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.selection.investigation import too_few_windows
-from imu_calibration.selection.onset import Onset
 from imu_calibration.selection.unexplained import Unexplained, biases_off
 
 MOST_SHOWN = 3
@@ -170,7 +169,7 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
 
 def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     """Return the findings, the unexplained residual of each sensor and the effects without a test, as lines."""
-    lines = onset_lines(diagnosis.onset)
+    lines = timing_lines(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
         lines.append(f'{number}. {finding.title}: {finding.explanation}')
         if finding.indistinguishable_from:
@@ -188,8 +187,13 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     return lines
 
 
-def onset_lines(onset: Onset | None) -> list[str]:
-    """Return the moment at which parameters change, with their values before and after, as lines."""
+def timing_lines(diagnosis: Diagnosis) -> list[str]:
+    """Return the moment at which parameters change, with their values before and after, and errors of the stamps, as lines."""
+    jitter = [] if diagnosis.stamp_jitter is None else diagnosis.stamp_jitter.lines
+    return [*_onset_lines(diagnosis.onset), *jitter]
+
+
+def _onset_lines(onset):
     if onset is None:
         return []
     largest = sorted(onset.before, key=lambda name: -abs(onset.after[name] - onset.before[name]))[:MOST_SHOWN]

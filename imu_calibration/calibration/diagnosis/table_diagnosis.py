@@ -72,7 +72,8 @@ def build_diagnosis(table: Table, found: Investigation, *, calibrated: Solution 
 
     """
     problem, named, limits = found.problem, found.named, found.limits
-    rests = ResidualAnalysis.of(found, table).unexplained
+    analysis = ResidualAnalysis.of(found, table)
+    rests = analysis.unexplained
     baseline = extended_solution(problem.space, problem.noise, problem.baseline, chosen=[])
     solution = extended_solution(problem.space, problem.noise, problem.baseline, chosen=named,
                                  saturations=limits) if named or limits else baseline
@@ -102,7 +103,7 @@ def build_diagnosis(table: Table, found: Investigation, *, calibrated: Solution 
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
     return Diagnosis(tuple(findings), rests, candidates_of(problem.search, named, agree=problem.windows_agree),
                      tuple(found.not_testable), baseline, solution, gain_of_findings(found, table, [], after=named, sensors=sensors),
-                     len(found.used), int(np.sum(problem.locked)), onset=found.onset)
+                     len(found.used), int(np.sum(problem.locked)), onset=found.onset, stamp_jitter=analysis.stamp_jitter)
 
 
 def _rivals(found, question):
