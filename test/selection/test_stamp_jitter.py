@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from worlds.hiding import record
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import timing_lines
 from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
 from imu_calibration.selection.stamp_jitter import stamp_jitter, without_jitter
+
+from worlds.hiding import record
 
 BLOCKS, FREEDOM, NOISE = 600, 13, (1e-8, 1e-10)
 
