@@ -11,6 +11,7 @@ from imu_calibration.selection import regimes
 from imu_calibration.selection.regime_variables import Variable, ranged
 from imu_calibration.selection.residual_blocks import RestBlocks
 from imu_calibration.selection.residual_fit import BlockFits
+from imu_calibration.selection.stamp_jitter import StampJitter
 
 WINDOWS, EACH = 60, 4
 TIME = np.arange(WINDOWS * EACH, dtype=float)
@@ -23,7 +24,7 @@ def blocks_of(rest, rough, locked=np.zeros(len(TIME), bool)):
     return RestBlocks('gyroscope', SimpleNamespace(rate_s=np.ones((len(TIME), 3))), starts=STARTS, time=TIME, window=WINDOW,
                       locked=locked, design=tuple(np.stack([np.ones(len(TIME)), column], axis=1) for column in rest.T),
                       index=tuple(np.zeros((3, 1), int)), variance=np.ones((len(TIME), 3)), processes=(BiasProcess(0.5, 100.0),),
-                      rough=rough, freedom=np.full(len(TIME), 12.0))
+                      rough=rough, freedom=np.full(len(TIME), 12.0), jitter=StampJitter(0.0, False))
 
 
 def found_in(monkeypatch, rest_of_x, rough_of_x=1.0):
