@@ -229,10 +229,10 @@ class SqliteWriter:
         """Append messages: arrays of topic ids and receive times, and the messages."""
         values: list[Any] = [None] * (3 * len(messages))
         values[0::3], values[1::3], values[2::3] = topic_ids.tolist(), received_ns.tolist(), messages.copies()
-        whole = len(messages) // INSERTED_ROWS * INSERTED_ROWS
-        for start, stop, rows in ((0, whole, INSERTED_ROWS), (whole, len(messages), 1)):
+        whole = 3 * (len(messages) // INSERTED_ROWS * INSERTED_ROWS)
+        for part, rows in ((values[:whole], INSERTED_ROWS), (values[whole:], 1)):
             self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES ' + ', '.join(['(?, ?, ?)'] * rows),
-                                        (values[3 * k:3 * (k + rows)] for k in range(start, stop, rows)))
+                                        zip(*[iter(part)] * (3 * rows), strict=True))
 
     def close(self, metadata_version: int, metadata: str) -> None:
         """Add the index by time and the metadata, and close."""

@@ -171,7 +171,8 @@ class PageReader:
             ordered = np.sort(pages)
             cuts = np.flatnonzero(np.diff(ordered) > 8) + 1
             runs = [(run[0], run[-1] + 1) for run in np.split(ordered, cuts)]
-        buffer = np.zeros(sum(int(last - first) for first, last in runs) * self.page_size + PADDING_BYTES, dtype=np.uint8)
+        buffer = np.empty(sum(int(last - first) for first, last in runs) * self.page_size + PADDING_BYTES, dtype=np.uint8)
+        buffer[-PADDING_BYTES:] = 0
         filled, firsts, bases = 0, [], []
         for first, last in runs:
             size = int(last - first) * self.page_size

@@ -60,39 +60,34 @@ class CompensationStream:
             first = imu.stamp_ns[:10_000]
             self.slope.settle(describe_stamps(first) or StampLine(REGULAR, 1e9 * (typical_period(first) or 0.01)))
         temperature, branch = self._warmth_at(imu.stamp_ns)
-        finite = np.isfinite(imu.rate_s).all(axis=1)
+        has_force, has_rate = (np.isfinite(values).all(axis=1) for values in (imu.force_s, imu.rate_s))
         slope = np.zeros_like(imu.rate_s)
-        slope[finite] = self.slope.push_block(imu.stamp_ns[finite], imu.rate_s[finite])
-        force_s, rate_s = (np.where(np.isfinite(values).all(axis=1, keepdims=True), values, self.calibration.of(sensor, Role.OFFSET))
-                           for sensor, values in (('accelerometer', imu.force_s), ('gyroscope', imu.rate_s)))
-        vibration = self._vibration_of(imu)
+        slope[has_rate] = self.slope.push_block(imu.stamp_ns[has_rate], imu.rate_s[has_rate])
+        force_s, rate_s = (np.where(given[:, None], values, self.calibration.of(sensor, Role.OFFSET)) for sensor, values, given
+                           in (('accelerometer', imu.force_s, has_force), ('gyroscope', imu.rate_s, has_rate)))
+        vibration = self._vibration_of(imu.force_s, has_force)
         corrected = compensate(self.calibration, force_s, rate_s, alpha_s=slope @ self._inverse_rate.T, temperature_c=temperature,
                                thermal_branch=branch, vibration=vibration, transfer=self.transfer)
-        corrected.force[~np.isfinite(imu.force_s).all(axis=1)] = np.nan
-        corrected.rate[~finite] = np.nan
+        corrected.force[~has_force] = np.nan
+        corrected.rate[~has_rate] = np.nan
         self.count, self.frame_id = self.count + len(imu), imu.frame_id
         self.flagged += int(corrected.flagged.sum())
-        if finite.any():
-            self._fastest = max(self._fastest, float(np.sqrt((imu.rate_s[finite]**2).sum(axis=1).max())))
-        self._remember(imu, slope, temperature, branch=branch, vibration=vibration)
-        return corrected
-
-    def _remember(self, imu, slope, temperature, *, branch, vibration):
-        usable = np.flatnonzero(np.isfinite(imu.rate_s).all(axis=1) & np.isfinite(imu.force_s).all(axis=1))
+        self._fastest = max(self._fastest, float(np.sqrt((imu.rate_s[has_rate]**2).sum(axis=1).max(initial=0.0))))
+        usable = np.flatnonzero(has_force & has_rate)
         if len(usable):
             k = usable[-1]
-            dt = 0.0 if temperature is None else float(temperature[k]) - self.calibration.model.temperature_ref_c
-            self._last = {'force': imu.force_s[k], 'rate': imu.rate_s[k], 'derivative': slope[k], 'dt': dt,
+            self._last = {'force': imu.force_s[k], 'rate': imu.rate_s[k], 'derivative': slope[k],
+                          'dt': 0.0 if temperature is None else float(temperature[k]) - self.calibration.model.temperature_ref_c,
                           'branch': 0.0 if branch is None else float(branch[k]),
                           'vibration': (0.0,) * 3 if vibration is None else tuple(vibration[k].tolist())}
+        return corrected
 
-    def _vibration_of(self, imu):
+    def _vibration_of(self, force_s, finite):
         """Return the variance of vibration at the finite samples of a block; None if it is not needed."""
         if self._vibration is None:
             return None
-        finite = np.isfinite(imu.force_s).all(axis=1)
-        vibration = np.tile(self._vibration.now, (len(imu), 1))
-        vibration[finite] = self._vibration.of(self.slope.period or 0.0, imu.force_s[finite])
+        vibration = np.tile(self._vibration.now, (len(force_s), 1))
+        vibration[finite] = self._vibration.of(self.slope.period or 0.0, force_s[finite])
         return vibration
 
     def _warmth_at(self, stamp_ns):

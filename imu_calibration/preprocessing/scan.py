@@ -329,35 +329,24 @@ class StandingJoints:
     CAPACITY = 10_000
 
     def __init__(self) -> None:
-        self._found: list[tuple[int, int]] = []
+        self._found = np.zeros((0, 2), np.int64)
+        self._open = np.zeros((1, 2), np.int64)
         self._last: np.ndarray | None = None
-        self._since, self._until = 0, 0
 
     def push(self, stamp_ns: np.ndarray, position: np.ndarray) -> None:
         """Process joint samples in order: stamps, shape (n,), and positions, shape (n, n_joints)."""
-        if self._last is not None and len(self._last) != position.shape[1]:
-            self._close()
-            self._last = None
-        before = position[:1] if self._last is None else self._last[None]
-        changed = np.any(position != np.concatenate([before, position[:-1]]), axis=1)
-        if self._last is None:
-            changed[0] = True
+        known = self._last is not None and len(self._last) == position.shape[1]
+        changed = np.any(position != np.concatenate([self._last[None] if known else position[:1], position[:-1]]), axis=1)
+        changed[0] |= not known
         starts = np.flatnonzero(changed)
-        for k, start in enumerate(starts):
-            if k == 0 and start > 0:
-                self._until = int(stamp_ns[start - 1])
-            self._close()
-            stop = starts[k + 1] if k + 1 < len(starts) else len(stamp_ns)
-            self._since, self._until = int(stamp_ns[start]), int(stamp_ns[stop - 1])
-        if not len(starts):
-            self._until = int(stamp_ns[-1])
-        self._last = position[-1].copy()
+        ends = np.append(self._open[0, 1], stamp_ns)[np.append(starts, len(stamp_ns))]
+        found = np.column_stack([np.append(self._open[0, 0], stamp_ns[starts]), ends])
+        self._found = np.concatenate([self._found, self._long(found[:-1])])[:self.CAPACITY]
+        self._open, self._last = found[-1:], position[-1].copy()
 
     def stretches(self) -> np.ndarray:
         """Return first and last stamp of each stretch until now, shape (n, 2)."""
-        open_one = [] if self._until - self._since < self.LEAST_NS else [(self._since, self._until)]
-        return np.array(self._found + open_one, np.int64).reshape(-1, 2)
+        return np.concatenate([self._found, self._long(self._open)])
 
-    def _close(self):
-        if self._until - self._since >= self.LEAST_NS and len(self._found) < self.CAPACITY:
-            self._found.append((self._since, self._until))
+    def _long(self, found):
+        return found[np.ptp(found, axis=1) >= self.LEAST_NS]

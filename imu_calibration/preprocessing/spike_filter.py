@@ -119,13 +119,19 @@ class SpikeFilter:
         change = np.abs(np.diff(values, axis=1))
         steps = np.where(change > 0, change, np.inf).min(axis=1)
         steps = np.minimum.accumulate(np.vstack([self._step, steps]))[1:]
-        usual = _NORMAL * np.median(parts, axis=1)
+        usual = _NORMAL * _median(parts)
         # a constant output (clipped, frozen, coarse) has no noise estimate: the previous one is kept
         known = np.vstack([self._noise[-1:], usual])
         last = np.maximum.accumulate(np.where(known > 0, np.arange(len(known))[:, None], 0))
         usual = np.take_along_axis(known, last, axis=0)[1:]
-        noise = np.maximum(np.maximum(usual, np.where(np.isfinite(steps), steps, 0.0)), NOISE_ROUNDING * np.abs(np.median(values, axis=1)))
+        noise = np.maximum(np.maximum(usual, np.where(np.isfinite(steps), steps, 0.0)), NOISE_ROUNDING * np.abs(_median(values)))
         self._noise, self._n_noise, self._step = np.vstack([self._noise, noise]), self._n_noise + len(noise), steps[-1]
+
+
+def _median(values):
+    """Return the median along axis 1; a sort of short columns is several times faster than the partition of `np.median`."""
+    ordered, count = np.sort(values, axis=1), values.shape[1]
+    return 0.5 * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])
 
 
 def _without_breaks(samples):
