@@ -331,14 +331,13 @@ class StandingJoints:
     def __init__(self) -> None:
         self._found = np.zeros((0, 2), np.int64)
         self._open = np.zeros((1, 2), np.int64)
-        self._last: np.ndarray | None = None
+        self._last = np.zeros(0)
 
     def push(self, stamp_ns: np.ndarray, position: np.ndarray) -> None:
         """Process joint samples in order: stamps, shape (n,), and positions, shape (n, n_joints)."""
-        known = self._last is not None and len(self._last) == position.shape[1]
-        changed = np.any(position != np.concatenate([self._last[None] if known else position[:1], position[:-1]]), axis=1)
-        changed[0] |= not known
-        starts = np.flatnonzero(changed)
+        if len(self._last) != position.shape[1]:
+            self._last = np.full(position.shape[1], np.nan)   # differs from any position
+        starts = np.flatnonzero(np.any(position != np.concatenate([self._last[None], position[:-1]]), axis=1))
         ends = np.append(self._open[0, 1], stamp_ns)[np.append(starts, len(stamp_ns))]
         found = np.column_stack([np.append(self._open[0, 0], stamp_ns[starts]), ends])
         self._found = np.concatenate([self._found, self._long(found[:-1])])[:self.CAPACITY]
