@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import AbstractSet
 
 import numpy as np
 
@@ -149,6 +150,31 @@ class _Outcome:
         return self.explained.rest(self.named)
 
 
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """One explanation of the lags with the outcome of its search."""
+
+    number: int
+    lags: AbstractSet[str]
+    outcome: _Outcome
+    rivals: Sequence[Rival]
+
+    @property
+    def rank(self):
+        """Numbers of its lags that are named and chosen, then the order of the attempts."""
+        named, chosen = (len(self.lags & {question.name for question in some}) for some in (self.outcome.named, self.outcome.chosen))
+        return named, chosen, -self.number
+
+    @property
+    def helps(self):
+        """Whether all of its lags are named."""
+        return self.rank[0] == len(self.lags)
+
+    def finished(self, linearised_at):
+        """Return the attempt without the lags that are not named; its rank may only fall."""
+        return replace(self, outcome=_without_unnamed(self.outcome, linearised_at))
+
+
 def _with_lags(explanations, linearised_at):
     """
     Return (the _Outcome with the simplest explanation of the lags all of which help, its rivals).
@@ -156,20 +182,31 @@ def _with_lags(explanations, linearised_at):
     Where one of several effects does not help, a shorter one is tried, where a single one does not, another.
     """
     most, refused, tried = None, [], []
-    for _ in range(EXPLANATIONS):
+    for number in range(EXPLANATIONS):
         selected = explanations.select(most, refused)
         there, chosen, of_lags = explanations.settled(selected, linearised_at)
         chosen = there.search.run(chosen)
         settled, rivals = settle_rivals(there, chosen, linearised_at)
-        outcome = _settled(linearised_at, settled, chosen if settled is there else _searched(settled, chosen))
+        outcome = _relinearised(linearised_at, settled, chosen if settled is there else _searched(settled, chosen))
+        attempt = _Attempt(number, selected.lags.keys(), outcome, [*of_lags, *rivals])
+        if attempt.helps and (attempt := attempt.finished(linearised_at)).helps:
+            return attempt.outcome, attempt.rivals
+        tried.append(attempt)
         most, refused = max(len(selected.lags) - 1, 1), [*refused, selected]
-        kept = [len(selected.lags.keys() & {question.name for question in some}) for some in (outcome.named, outcome.chosen)]
-        tried.append((kept, outcome, [*of_lags, *rivals]))
-        if kept[0] == len(selected.lags):
-            return tried[-1][1:]
         if not explanations.others(most, refused):
             break
-    return max(tried, key=lambda entry: entry[0])[1:]
+    best = _best_of(tried, linearised_at)
+    return best.outcome, best.rivals
+
+
+def _best_of(attempts, linearised_at):
+    """Return the attempt with the highest rank; only those that may have it are finished."""
+    best = None
+    for attempt in sorted(attempts, key=lambda attempt: attempt.rank, reverse=True):
+        if best is None or attempt.rank > best.rank:
+            finished = attempt.finished(linearised_at)
+            best = finished if best is None or finished.rank > best.rank else best
+    return best
 
 
 def _looked_again(outcome, linearised_at, any_size):
@@ -194,6 +231,11 @@ def _looked_again(outcome, linearised_at, any_size):
 
 def _settled(linearised_at, problem, chosen):
     """Return the _Outcome of a choice: relinearise at the effects, then keep the ones with sufficient share and gain."""
+    return _without_unnamed(_relinearised(linearised_at, problem, chosen), linearised_at)
+
+
+def _relinearised(linearised_at, problem, chosen):
+    """Return the same, linearised at all effects of the choice."""
     for _ in range(LINEARISATIONS - 1):
         if not problem.needs_another(chosen):
             break
@@ -203,15 +245,19 @@ def _settled(linearised_at, problem, chosen):
     chosen = [question for question in chosen if '@' not in question.label]
     explained = ExplainedWindows(problem.evidence, problem.search)
     first = simpler(problem, explained, pruned(chosen, explained.share))
-    named, unstable = _agreed(problem, explained, _that_help(problem, explained, first))
+    return _Outcome(problem, explained, chosen, *_agreed(problem, explained, _that_help(problem, explained, first)))
+
+
+def _without_unnamed(outcome, linearised_at):
+    """Return the _Outcome linearised at its findings alone, where lags or errors of the table that are not named act at its point."""
     for _ in range(LINEARISATIONS - 1):
-        if not problem.acts_beside(named):
+        if not outcome.problem.acts_beside(outcome.named):
             break
-        problem = linearised_at(point=problem.point(named))
+        problem = linearised_at(point=outcome.problem.point(outcome.named))
         explained = ExplainedWindows(problem.evidence, problem.search)
-        again, unstable, chosen = (same_questions(problem, some) for some in (named, unstable, chosen))
-        named = _that_help(problem, explained, pruned(again, explained.share))
-    return _Outcome(problem, explained, chosen, named, unstable)
+        named, unstable, chosen = (same_questions(problem, some) for some in (outcome.named, outcome.unstable, outcome.chosen))
+        outcome = _Outcome(problem, explained, chosen, _that_help(problem, explained, pruned(named, explained.share)), unstable)
+    return outcome
 
 
 def _searched(problem, chosen):

@@ -1,5 +1,6 @@
 """A formula for the unexplained residual: search, test on held-out windows, description and a term for a model."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -97,29 +98,44 @@ class Proposal:
                 'confirming_motion': self.motion, 'sentence': self.sentence}
 
 
-def propose(blocks: RestBlocks, problem: LinearisedProblem, fits: BlockFits) -> Proposal | None:
+def find_formulas(blocks: RestBlocks, problem: LinearisedProblem) -> list[FormulaChoice]:
     """
-    Return a Proposal for the residual of a sensor with the chosen effects, or None where no formula removes most of it.
+    Return the formulas that a sensor's residual follows most likely, each in addition to the earlier ones, at most `MOST_TERMS`.
 
-    Formulas are chosen on the selection windows, with all plausible contributions of the catalogue projected out; the share is
-    from the locked windows with the findings in the model, and both halves of the selection windows must agree.
+    They are chosen on the selection windows, with all plausible contributions of the catalogue projected out.
     """
     search = FormulaSearch(blocks, _grammar(blocks), _plausible(blocks.sensor, problem),
                            reference_temperature=problem.recording.model.temperature_ref_c)
+    found: list[FormulaChoice] = []
+    while len(found) < MOST_TERMS:
+        if found:
+            search.take(found[-1])
+        choice = search.best()
+        if choice is None:
+            break
+        found.append(choice)
+    return found
+
+
+def propose(blocks: RestBlocks, problem: LinearisedProblem, fits: BlockFits, *, formulas: Sequence[FormulaChoice]) -> Proposal | None:
+    """
+    Return a Proposal for the residual of a sensor with the chosen effects, or None where no formula removes most of it.
+
+    Of the `formulas` (`find_formulas`) the first ones are taken on which both halves of the selection windows agree and that add enough;
+    the share is from the locked windows with the findings in the model.
+    """
     plain = fits.fit()
     if plain.excess <= 0:
         return None
     choices: list[FormulaChoice] = []
     share = 0.0
-    while len(choices) < MOST_TERMS:
-        found = search.best()
-        if found is None or not _stable(fits, [*choices, found]):
+    for found in formulas:
+        if not _stable(fits, [*choices, found]):
             break
         grown = share_removed(plain, fits.fit(_joined([*choices, found])))
         if choices and grown < share + WORTH_A_SECOND:
             break
         choices, share = [*choices, found], grown
-        search.take(found)
     needed = MIN_SMOOTH_SHARE if any(choice.formula.smooth for choice in choices) else MIN_FORMULA_SHARE
     if not choices or share < needed:
         return None

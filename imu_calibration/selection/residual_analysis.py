@@ -12,8 +12,9 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.explained_share import sensors_of
+from imu_calibration.selection.formulas import FormulaChoice
 from imu_calibration.selection.investigation import Investigation, investigate
-from imu_calibration.selection.proposals import Proposal, propose
+from imu_calibration.selection.proposals import Proposal, find_formulas, propose
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regimes import RestRegime, find_regimes
 from imu_calibration.selection.residual_blocks import RestBlocks, rest_blocks
@@ -35,6 +36,7 @@ class ResidualAnalysis(Investigation):
     table: Table
     """The reference."""
     _fits: dict = field(default_factory=dict, init=False, repr=False)
+    _formulas: dict = field(default_factory=dict, init=False, repr=False)
     _proposals: dict = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
@@ -66,6 +68,16 @@ class ResidualAnalysis(Investigation):
         return find_regimes(self.blocks[sensor], self.problem, sorted(fits.used), joint_names=self.table.joint_names,
                             axes=fits.axes() if offsets else (), formula=formula)
 
+    def formulas(self, sensor: str) -> list[FormulaChoice]:
+        """Return the likeliest formulas for the residual of a sensor, for any choice of effects (`find_formulas`)."""
+        if sensor not in self._formulas:
+            self._formulas[sensor] = find_formulas(self.blocks[sensor], self.problem)
+        return self._formulas[sensor]
+
+    def proposed(self, sensor: str, fits: BlockFits) -> Proposal | None:
+        """Return a formula for the residual of a sensor with the choice of some fits (`propose`)."""
+        return propose(self.blocks[sensor], self.problem, fits, formulas=self.formulas(sensor))
+
     def proposal(self, sensor: str) -> Proposal | None:
         """
         Return a formula for the residual of a sensor, where it is significant or clear within moving windows.
@@ -75,7 +87,7 @@ class ResidualAnalysis(Investigation):
         if sensor not in self._proposals:
             fits = self.fits(sensor)
             clear = self.rests[sensor].significant or fits.sigma > MIN_FORMULA_SDS
-            self._proposals[sensor] = propose(self.blocks[sensor], self.problem, fits) if clear else None
+            self._proposals[sensor] = self.proposed(sensor, fits) if clear else None
         return self._proposals[sensor]
 
     def columns(self, sensor: str, proposal: Proposal | None) -> np.ndarray | None:
@@ -127,6 +139,7 @@ class ResidualAnalysis(Investigation):
         other = replace(self, named=[question for question in self.named if question not in gone], rejected=[*self.rejected, *gone],
                         rivals=[rival for rival in self.rivals if rival.question.name not in names])
         other.__dict__['blocks'] = self.blocks
+        other._formulas.update(self._formulas)
         return other
 
 
@@ -179,7 +192,7 @@ def _done_without(found, question):
     kept, left_out = ({sensor: found.fits(sensor, some) for sensor in sensors} for some in (found.named, others))
     alone = {sensor: left_out[sensor].fit().excess - kept[sensor].fit().excess for sensor in sensors}
     for stand_in in (lambda sensor: found.columns(sensor, found.proposal(sensor)),
-                     lambda sensor: found.columns(sensor, propose(found.blocks[sensor], found.problem, left_out[sensor])),
+                     lambda sensor: found.columns(sensor, found.proposed(sensor, left_out[sensor])),
                      lambda sensor: _places(found, sensor, others)):
         beside = dict(alone)
         for sensor in asked:

@@ -15,7 +15,7 @@ from imu_calibration.effects.expressions import ColumnGroup
 from imu_calibration.selection import proposals
 from imu_calibration.selection.formulas import grammar
 from imu_calibration.selection.investigation import investigate
-from imu_calibration.selection.proposals import propose
+from imu_calibration.selection.proposals import find_formulas, propose
 from imu_calibration.selection.regime_variables import variables_of
 from imu_calibration.selection.regimes import find_regimes
 from imu_calibration.selection.residual_analysis import ResidualAnalysis, without_superseded
@@ -49,6 +49,10 @@ def looked(kind=None, seed=5):
 def fits_of(found, blocks):
     space, used = found.problem.space, found.problem.search.indices(found.named)
     return BlockFits(blocks, used, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
+
+
+def proposed(found, blocks, fits):
+    return propose(blocks, found.problem, fits, formulas=find_formulas(blocks, found.problem))
 
 
 def test_the_grammar_is_arithmetic_with_units_and_speaks_of_what_it_says():
@@ -116,7 +120,7 @@ def test_a_formula_is_found_and_judged_on_windows_that_took_no_part(kind, text):
 def test_nothing_is_proposed_where_nothing_is_hidden_even_when_asked():
     found, blocks, _ = looked()
     for sensor in blocks:
-        assert propose(blocks[sensor], found.problem, fits_of(found, blocks[sensor])) is None
+        assert proposed(found, blocks[sensor], fits_of(found, blocks[sensor])) is None
         assert not find_regimes(blocks[sensor], found.problem, found.problem.search.indices([]), joint_names=('outer', 'middle', 'inner'))
 
 
@@ -124,7 +128,7 @@ def test_a_formula_that_takes_little_off_held_out_windows_is_a_story(monkeypatch
     found, blocks, cause = looked('scale_under_load')
     fits = fits_of(found, blocks['gyroscope'])
     monkeypatch.setattr(proposals, 'share_removed', lambda before, after: 0.5)
-    assert propose(blocks['gyroscope'], found.problem, fits) is None
+    assert proposed(found, blocks['gyroscope'], fits) is None
 
 
 def test_halves_that_disagree_make_no_formula(monkeypatch):
@@ -133,7 +137,7 @@ def test_halves_that_disagree_make_no_formula(monkeypatch):
     late = sensor.time > np.median(sensor.time)
     turned = tuple(np.concatenate([part[:, :-1], np.where(late, -1.0, 1.0)[:, None] * part[:, -1:]], axis=1) for part in sensor.design)
     upset = replace(sensor, design=turned)
-    told = propose(upset, found.problem, fits_of(found, upset))
+    told = proposed(found, upset, fits_of(found, upset))
     assert told is None or 'f_z * w' not in str(told.columns)
 
 

@@ -1,12 +1,13 @@
 """Diagnosis as plain functions, on a table and by hand, and its result as lines of text."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
+from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, formula_gain, to_mapping
 from imu_calibration.calibration.diagnosis.hand_diagnosis import told_by_hand
 from imu_calibration.calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST
@@ -21,11 +22,13 @@ from imu_calibration.document.verdict import misfits, unsteady
 from imu_calibration.effects.base import SENSORS, UNITS, Effect, Role
 from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
+from imu_calibration.estimation.window_statistics import reduce_window
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.window import StoredWindows
 from imu_calibration.references.gravity.model_selection import too_few_poses
 from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.selection.investigation import too_few_windows
 from imu_calibration.selection.unexplained import Unexplained, biases_off
 
@@ -85,6 +88,25 @@ class DiagnosisResult:
         return total_lags(found.param_names, found.values, found.covariance)
 
 
+class StoredRecording:
+    """The map step of a calibration from one recording, which is read once: later linearisations reduce its stored windows."""
+
+    def __init__(self) -> None:
+        self.windows = StoredWindows()
+        self._first: SessionData | None = None
+
+    def __call__(self, step: GatherStep, numbered: Iterable[tuple[int, Callable]]) -> list[SessionData]:
+        """Return the SessionData of the recording, given (its number, callable that yields its blocks)."""
+        ((session, source),) = numbered
+        if self._first is None:
+            self._first = step.read(source(), session, Preflight(step.table.gravity_value), windows=self.windows)
+            return [self._first]
+        windows = (self.windows[number] for number in range(len(self.windows)))
+        reduced = (reduce_window(window, step.model, step.table, session=session, with_pieces=True) for window in windows
+                   if window.kind != 'unused')
+        return [self._first.anew(reduced, step.judged_from)]
+
+
 def diagnose_recording(source: Callable, table: Table, options: CalibrationOptions = CalibrationOptions(), *,
                        provenance: dict[str, Any] | None = None) -> DiagnosisResult:
     """
@@ -104,23 +126,19 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
     DiagnosisResult
 
     """
-    windows = StoredWindows()
-
-    def read(step, numbered):
-        return [step.read(source(), session, Preflight(table.gravity_value), windows=windows if not windows else None) for session,
-                source in numbered]
-    calibrated = calibrate_by_evidence([source], table, replace(options, as_asked=False), provenance=provenance, mapper=read)
+    reader = StoredRecording()
+    calibrated = calibrate_by_evidence([source], table, replace(options, as_asked=False), provenance=provenance, mapper=reader)
     if calibrated.found is None:
         raise too_few_windows(len(calibrated.result.gathered.spreads[0].windows))
     result, diagnosis = calibrated.result, build_diagnosis(table, calibrated.found, calibrated=calibrated.result.solution)
-    proposed = _with_proposals(source, table, options, result, diagnosis, provenance)
-    traces = residual_traces(windows, table, diagnosis.baseline, after=proposed or diagnosis.solution)
+    proposed = _with_proposals(source, table, options, result, diagnosis, provenance, reader)
+    traces = residual_traces(reader.windows, table, diagnosis.baseline, after=proposed or diagnosis.solution)
     diagnosis = replace(diagnosis, traces=traces)
     return DiagnosisResult(diagnosis, result.calibration, result.tolerances, result.needed, result.observations, baseline_options(options),
                            proposed)
 
 
-def _with_proposals(source, table, options, result, diagnosis, provenance):
+def _with_proposals(source, table, options, result, diagnosis, provenance, reader):
     """Return the calibration of the extended model with the proposed formulas, or None without a formula."""
     effects = proposed_effects(diagnosis)
     if not effects:
@@ -131,7 +149,7 @@ def _with_proposals(source, table, options, result, diagnosis, provenance):
                                *(e.name for e in effects if e.sensor == sensor)]) for sensor in (*SENSORS, 'reference')}
     chosen = replace(options, accelerometer_model=texts['accelerometer'], gyroscope_model=texts['gyroscope'],
                      reference_model=texts['reference'] or 'none', catalogue=catalogue, as_asked=True)
-    solution, gathered, gathered_model = solve_recordings([source], table, chosen)
+    solution, gathered, gathered_model = solve_recordings([source], table, chosen, mapper=reader)
     # A formula determines changes of the output, not its zero: biases of the affected axes keep the uncertainty.
     unsure = ModelExtension(moves=tuple((moved, 1.0) for moved in biases_off(model, diagnosis.unexplained)))
     return conclude(unsure.applied(solution), gathered, gathered_model, table=table, options=chosen, provenance=provenance).calibration

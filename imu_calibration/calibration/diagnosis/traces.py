@@ -208,16 +208,16 @@ def residual_traces(windows: Sequence[Window] | StoredWindows, table: Table, bef
         Extended model.
 
     """
-    models = before, after
+    models = [before] if after is before else [before, after]
     sums, parts, counts, warmth, spans = DistanceSums(), [], [], [], []
     for group in chunks(_used(windows, spans)):
         rest, against = [residuals(group, table, each.model, values=each.values) for each in models], _variables(group, table, before)
         ends = np.cumsum([len(window) for window in group])
         for window, stop in zip(group, ends):
             rows = slice(stop - len(window), stop)
-            sums.add(window, [{sensor: own[rows] for sensor, own in each.items()} for each in rest], before.noise)
+            sums.add(window, [{sensor: own[rows] for sensor, own in each.items()} for each in (rest[0], rest[-1])], before.noise)
         block, number, n_blocks = _blocks(group)
-        values = [np.concatenate([w.time for w in group]), *against[:3], *(each[s] for each in rest for s in SENSORS)]
+        values = [np.concatenate([w.time for w in group]), *against[:3], *(each[s] for each in (rest[0], rest[-1]) for s in SENSORS)]
         parts.append([_block_mean(value, block, number) for value in values])
         warmth.append(None if against[3] is None else _block_mean(against[3], block, number))
         counts.append((number, np.repeat([str(w.kind) for w in group], n_blocks)))
@@ -251,9 +251,9 @@ def _largest(time, residual):
 def _segment(windows, spans, table, models, sensor, axis, start, stop):
     inside = [windows[k] for k, (first, last) in enumerate(spans) if last >= start and first <= stop]
     time = np.concatenate([window.time for window in inside])
-    found = {'measured': np.concatenate([measured(window, sensor)[:, axis] for window in inside])}
-    for name, model in zip(('simulated before', 'simulated after'), models):
-        found[name] = predict_windows(inside, table, model.model, values=model.values)[sensor][:, axis]
+    simulated = [predict_windows(inside, table, each.model, values=each.values)[sensor][:, axis] for each in models]
+    found = {'measured': np.concatenate([measured(window, sensor)[:, axis] for window in inside]),
+             'simulated before': simulated[0], 'simulated after': simulated[-1]}
     rows = np.flatnonzero((time >= start) & (time <= stop))
     size = max(1, len(rows) // POINTS)
     rows = rows[:len(rows) // size * size].reshape(-1, size)
@@ -302,8 +302,8 @@ def _dead_reckoning(windows, spans, table, models):
     chosen = [stretches[k] for k in np.unique(np.linspace(0, len(stretches) - 1, MOST_STRETCHES).round().astype(int))]
     drifts = [_drifts([windows[k] for k in stretch], table, models) for stretch in chosen]
     velocity, position = np.median(drifts, axis=0).T
-    return {'seconds': DEAD_RECKONING, 'position_before': float(position[0]), 'position_after': float(position[1]),
-            'velocity_before': float(velocity[0]), 'velocity_after': float(velocity[1]), 'stretches': len(chosen)}
+    return {'seconds': DEAD_RECKONING, 'position_before': float(position[0]), 'position_after': float(position[-1]),
+            'velocity_before': float(velocity[0]), 'velocity_after': float(velocity[-1]), 'stretches': len(chosen)}
 
 
 def _drifts(windows, table, models):
