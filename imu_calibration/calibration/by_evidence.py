@@ -181,7 +181,7 @@ def _changes(searches, added):
     clipping = (model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name for limit in found.limits)
     rests = {sensor: rest.entry for each in reversed(searches) for sensor, rest in each.released().items() if rest.significant}
     return ModelChanges((*clipping, *(name for _, name in added)), tuple(question.name for question in found.unstable), _strange(searches),
-                        unexplained=rests)
+                        unexplained=rests, stamp_jitter=found.stamp_jitter.to_mapping())
 
 
 def _beyond(named, model):

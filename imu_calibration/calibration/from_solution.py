@@ -45,18 +45,21 @@ class ModelChanges:
     """Demanded, but the motion of before is no longer kept, so that they cannot join; the standard deviations allow for them."""
     unexplained: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Sensor -> rms and axes of its unexplained residual, by the test of `diagnose`."""
+    stamp_jitter: dict[str, Any] = field(default_factory=dict)
+    """Sd of independent errors of the stamps and the variance ratios they cause (`StampJitter`), empty where not significant."""
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""
         changes = (('added', list(self.added)), ('denied', list(self.unstable)), ('implausible', self.implausible),
-                   ('lacking', list(self.lacking)), ('unexplained', self.unexplained))
+                   ('lacking', list(self.lacking)), ('unexplained', self.unexplained), ('stamp_jitter', self.stamp_jitter))
         return {name: value for name, value in changes if value}
 
     @classmethod
     def from_mapping(cls, known: Mapping[str, Any]) -> 'ModelChanges':
         """Return the changes from the mapping of `to_mapping`."""
         return cls(tuple(known.get('added', ())), tuple(known.get('denied', ())), dict(known.get('implausible', {})),
-                   tuple(known.get('lacking', ())), dict(known.get('unexplained', {})))
+                   tuple(known.get('lacking', ())), dict(known.get('unexplained', {})),
+                   dict(known.get('stamp_jitter', {})))
 
 
 @dataclass(frozen=True, eq=False)

@@ -266,9 +266,10 @@ HAND_AXES = 'accelerometer_lower_triangular'
 
 
 def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:
-    """Return kind of window -> ratio of the residual variance of the sensor to its noise variance."""
+    """Return kind of window -> ratio of the residual variance of the sensor to that of its noise and of errors of the stamps."""
     chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
-    return {kind: ratio for kind, ratio in chi2.items() if kind != 'means'}
+    by_stamps = (calibration.statistics.get('stamp_jitter') or {}).get('variance_ratio', {}).get(sensor, {})
+    return {kind: ratio / by_stamps.get(kind, 1.0) for kind, ratio in chi2.items() if kind != 'means'}
 
 
 def quiet(calibration: Calibration) -> str:

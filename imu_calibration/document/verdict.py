@@ -46,7 +46,7 @@ def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     """Return the notes; arguments as in `verdict.judge`."""
     remaining = [Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)]
     return (_worse(calibration) + _unused_rests(calibration) + remaining + _adopted(calibration) + _unexplained(calibration)
-            + unsteady(calibration, tolerances) + _left_out(calibration) + _lost(calibration))
+            + _jitter(calibration) + unsteady(calibration, tolerances) + _left_out(calibration) + _lost(calibration))
 
 
 def _worse(calibration):
@@ -95,6 +95,13 @@ def _unexplained(calibration):
 def unexplained_text(sensor: str, rms: float, unit: str | None = None) -> str:
     """Return the statement of an unexplained residual; `unit` where it is not the sensor's."""
     return f'{error_text(rms, unit or UNITS[sensor], 2)} rms of the {sensor} residual are unexplained'
+
+
+def _jitter(calibration):
+    """Return a note on independent errors of the stamps."""
+    found = calibration.statistics.get('stamp_jitter')
+    return [Reason(NOTE, f'the stamps have independent errors of {1e6 * found["sd_s"]:.0f} us (1 sd), which explain scatter in motion',
+                   "use stamps of the sensor's own clock")] if found else []
 
 
 def _strange(values):

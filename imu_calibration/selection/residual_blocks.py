@@ -1,7 +1,7 @@
 """The residual of one sensor in short blocks, with the columns of all candidate effects: data for regimes and formulas."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +20,7 @@ from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.noise_beside_effects import natural_processes
 from imu_calibration.selection.questions import TEMPERATURE_SPAN
 from imu_calibration.selection.saturation import measured
-from imu_calibration.selection.stamp_jitter import StampJitter, stamp_jitter, without_jitter
+from imu_calibration.selection.stamp_jitter import StampJitter, jitter_ratio, stamp_jitter
 from imu_calibration.simulation.session import predict_windows
 
 MIN_BLOCK_SECONDS = 0.25
@@ -143,6 +143,9 @@ def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProb
     slope = {sensor: _slope(residual, windows, edges, sensor) for sensor, residual in left.items()}
     freedom = _freedom(windows, edges)
     jitter = stamp_jitter(list(rough.values()), list(slope.values()), freedom)
+    louder = {sensor: jitter_ratio(rough[sensor], slope[sensor], jitter.sd) for sensor in left}
+    of_kind = {str(kind): problem.recording.kind[number] == kind for kind in np.unique(problem.recording.kind[number]) if kind != 'static'}
+    jitter = replace(jitter, ratio={sensor: {kind: float(louder[sensor][own].mean()) for kind, own in of_kind.items()} for sensor in left})
     for sensor, residual in left.items():
         mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
         floor = explained.floor.noise[sensor]
@@ -154,7 +157,7 @@ def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProb
         design = tuple(rows @ join for join in problem.space.join[sensor])
         found[sensor] = RestBlocks(sensor, references.at(sensor), **common, design=design, index=tuple(problem.space.index[sensor]),
                                    variance=variance, processes=processes, freedom=freedom,
-                                   rough=without_jitter(rough[sensor], slope[sensor], jitter.sd), jitter=jitter)
+                                   rough=rough[sensor] / louder[sensor], jitter=jitter)
     return found
 
 

@@ -1,7 +1,8 @@
 """Independent errors of the time stamps, from the scatter of the residual in motion; the scatter without them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -25,12 +26,19 @@ class StampJitter:
     """Their standard deviation, s."""
     significant: bool
     """Whether the scatter of each sensor alone shows errors of this size."""
+    ratio: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Sensor -> kind of moving window -> variance of the noise and these errors over that of the noise."""
 
     @property
     def lines(self) -> list[str]:
         """Description, empty where they are not significant."""
         text = f'stamps: independent errors of {1e6 * self.sd:.0f} us (1 sd) explain the scatter of both sensors in motion'
         return [text] * self.significant
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the entry of a calibration document, empty where they are not significant."""
+        ratio = {sensor: dict(kinds) for sensor, kinds in self.ratio.items()}
+        return {'sd_s': self.sd, 'variance_ratio': ratio} if self.significant else {}
 
 
 def stamp_jitter(rough: Sequence[np.ndarray], slope: Sequence[np.ndarray], freedom: np.ndarray) -> StampJitter:
@@ -59,9 +67,9 @@ def stamp_jitter(rough: Sequence[np.ndarray], slope: Sequence[np.ndarray], freed
     return StampJitter(float(np.sqrt(variance)), bool(np.all(value > CLEAR_SDS * sd) and alike.all()))
 
 
-def without_jitter(rough: np.ndarray, slope: np.ndarray, jitter: float) -> np.ndarray:
-    """Return the variances within the blocks of one sensor over their increase by errors of the stamps, shape (b, 3)."""
-    return rough / (1.0 + jitter**2 * slope / _noise(rough, slope, jitter**2))
+def jitter_ratio(rough: np.ndarray, slope: np.ndarray, jitter: float) -> np.ndarray:
+    """Return the variance of the noise and the errors of the stamps (sd `jitter`, s) over that of the noise, shape (b, 3)."""
+    return 1.0 + jitter**2 * slope / _noise(rough, slope, jitter**2)
 
 
 def _noise(rough, slope, variance):

@@ -1,14 +1,22 @@
 """Independent errors of the stamps: their size from the scatter of both sensors in motion, and no regime where they explain it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+import imu_calibration as imu
 from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import timing_lines
 from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
-from imu_calibration.selection.stamp_jitter import stamp_jitter, without_jitter
+from imu_calibration.document.calibration import NOTED_MISFIT, misfit_ratios
+from imu_calibration.document.decision import WARNING
+from imu_calibration.document.verdict import misfits
+from imu_calibration.kinematics.table import Table
+from imu_calibration.selection.stamp_jitter import jitter_ratio, stamp_jitter
 
 from worlds.hiding import record
+from worlds.physics import make_session
 
 BLOCKS, FREEDOM, NOISE = 600, 13, (1e-8, 1e-10)
 
@@ -29,20 +37,20 @@ def test_the_size_of_the_errors_is_estimated_and_their_scatter_removed(sd):
     found = stamp_jitter(rough, slope, freedom)
     assert found.significant and found.sd == pytest.approx(sd, rel=0.05) and len(found.lines) == 1
     for own, steep, noise in zip(rough, slope, NOISE):
-        assert np.median(without_jitter(own, steep, found.sd)[steep[:, 0] > 0]) == pytest.approx(noise, rel=0.15)
+        assert np.median((own / jitter_ratio(own, steep, found.sd))[steep[:, 0] > 0]) == pytest.approx(noise, rel=0.15)
 
 
 def test_scatter_of_one_sensor_is_no_error_of_the_stamps():
     rough, slope, freedom = blocks((1e-4, 0.0))
     found = stamp_jitter(rough, slope, freedom)
     assert not found.significant and found.sd < 1e-5 and not found.lines
-    assert without_jitter(rough[0], slope[0], found.sd) == pytest.approx(rough[0], rel=0.2)
+    assert jitter_ratio(rough[0], slope[0], found.sd).max() < 1.2
 
 
 def test_no_jitter_changes_nothing():
     rough, slope, freedom = blocks((0.0, 0.0))
     assert not stamp_jitter(rough, slope, freedom).significant
-    assert np.array_equal(without_jitter(rough[0], slope[0], 0.0), rough[0])
+    assert np.all(jitter_ratio(rough[0], slope[0], 0.0) == 1.0)
 
 
 def test_a_navigation_grade_session_with_irregular_stamps_has_no_regime():
@@ -52,3 +60,14 @@ def test_a_navigation_grade_session_with_irregular_stamps_has_no_regime():
     assert not any(rest.significant for rest in diagnosis.unexplained.values())
     assert to_mapping(diagnosis)['stamp_jitter_s'] == pytest.approx(50e-6, rel=0.1)
     assert timing_lines(diagnosis) == diagnosis.stamp_jitter.lines != []
+
+
+def test_a_calibration_does_not_call_scatter_by_the_stamps_an_incomplete_model():
+    session = make_session(6, None, 'realistic', grade='navigation')
+    result = imu.calibrate(session.block, Table.from_mapping(session.table))
+    entry = result.calibration.statistics['stamp_jitter']
+    assert entry['sd_s'] == pytest.approx(50e-6, rel=0.1) and entry['variance_ratio']['gyroscope']['spin'] > 100
+    assert max(misfit_ratios(result.calibration, 'gyroscope').values()) < NOTED_MISFIT
+    assert not misfits(result.calibration)
+    without = replace(result.calibration, statistics={k: v for k, v in result.calibration.statistics.items() if k != 'stamp_jitter'})
+    assert {reason.word for reason in misfits(without)} >= {WARNING}
