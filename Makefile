@@ -122,12 +122,12 @@ $(STAMP)-validate: $(STAMP) constraints/validate.txt
 
 # The parameter files of the nodes from what the nodes declare, the tolerances from the catalogue of effects.
 config: $(STAMP)
-	@$(PY) -m imu_calibration.nodes.parameters
+	@$(PY) -m tools.parameter_files
 	@$(PY) -m tools.tolerance_file
 
 # Pages that are written from what runs: the targets of exports, the answers with their commands and pictures.
 answers: $(STAMP)
-	@$(PY) -m imu_calibration.document.exports.export
+	@$(PY) -m tools.exports_page
 	@$(PY) examples/answers.py
 
 # Noise identified on 204 simulated records of ten minutes to three hours: intervals and errors, the tables of docs/noise.md; half an hour.

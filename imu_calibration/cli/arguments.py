@@ -70,8 +70,7 @@ def add_model_arguments(parser: OneLineParser, *, searched: bool = True) -> None
     """Add the options that choose the parameters to estimate; `searched`: and the option that omits the search for effects."""
     group = parser.expert
     expert = group.add_argument
-    expert('--accelerometer-model', metavar='MODEL', help='effects joined by +; default bias+matrix, and '
-           'accel_size_effect if observable')
+    expert('--accelerometer-model', metavar='MODEL', help='effects joined by +; default bias+matrix, and accel_size_effect if observable')
     expert('--gyroscope-model', metavar='MODEL', help='likewise; default bias+matrix')
     expert('--reference-model', metavar='MODEL', help="effects of table and clock, or 'none'; default table_tilt")
     add_effects_argument(group)

@@ -165,13 +165,23 @@ class Calibration:
         return compensate_readings(self, samples, rate_s, time=time, temperature_c=temperature_c)
 
     def __repr__(self):
-        return summary(self)
+        known = list(self.status_by_name.values())
+        counts = ', '.join(f'{known.count(status)} {status}' for status in Status if status in known)
+        return f'<Calibration of {self.frame_id or "an IMU"}: {decisions_text(self.decisions)}, {counts}>'
 
     def __str__(self):
-        return as_text(self)
+        rows = [PARAMETER_HEADINGS, *parameter_rows(self)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        aligned = ('  '.join(cell.rjust(width) if heading in NUMBER_COLUMNS else cell.ljust(width)
+                             for cell, width, heading in zip(row, widths, PARAMETER_HEADINGS)) for row in rows)
+        return '\n'.join([repr(self), *map(str.rstrip, aligned)])
 
     def _repr_html_(self):
-        return as_html(self)
+        def row(cells: tuple[str, ...], tag: str) -> str:
+            style = [f' style="text-align:{"right" if heading in NUMBER_COLUMNS else "left"}"' for heading in PARAMETER_HEADINGS]
+            return '<tr>' + ''.join(f'<{tag}{s}>{escape(cell)}</{tag}>' for cell, s in zip(cells, style, strict=True)) + '</tr>'
+        body = ''.join(row(cells, 'td') for cells in parameter_rows(self))
+        return f'<table><caption>{escape(repr(self))}</caption>{row(PARAMETER_HEADINGS, "th")}{body}</table>'
 
 
 PARAMETER_HEADINGS = ('parameter', 'value', 'sd', 'unit', 'status')
@@ -179,7 +189,7 @@ NUMBER_COLUMNS = ('value', 'sd')
 """Columns that are set flush right."""
 
 
-def parameter_rows(calibration: 'Calibration') -> Iterator[tuple[str, ...]]:
+def parameter_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
     """Yield the cells of each parameter in the order of `PARAMETER_HEADINGS`."""
     for effect in calibration.model.effects:
         part = calibration.model.slices[effect.key]
@@ -189,33 +199,6 @@ def parameter_rows(calibration: 'Calibration') -> Iterator[tuple[str, ...]]:
             yield calibration.param_names[index], value, sd, unit, str(calibration.status[index])
     if common := calibration.common_scale:
         yield COMMON_SCALE, *with_sd(1.0, common['sd']), '1', str(common['status'])
-
-
-def summary(calibration: 'Calibration') -> str:
-    """Return one line: the frame, the decisions, and how many parameters have which status."""
-    known = list(calibration.status_by_name.values())
-    counts = {status: known.count(status) for status in Status}
-    parts = ', '.join(f'{count} {status}' for status, count in counts.items() if count)
-    return f'<Calibration of {calibration.frame_id or "an IMU"}: {decisions_text(calibration.decisions)}, {parts}>'
-
-
-def as_text(calibration: 'Calibration') -> str:
-    """Return the parameters as a table of plain text."""
-    rows = [PARAMETER_HEADINGS, *parameter_rows(calibration)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    aligned = ('  '.join(cell.rjust(width) if heading in NUMBER_COLUMNS else cell.ljust(width)
-                         for cell, width, heading in zip(row, widths, PARAMETER_HEADINGS))
-               for row in rows)
-    return '\n'.join([summary(calibration), *map(str.rstrip, aligned)])
-
-
-def as_html(calibration: 'Calibration') -> str:
-    """Return the parameters as an HTML table, for notebooks."""
-    def row(cells: tuple[str, ...], tag: str) -> str:
-        style = [' style="text-align:right"' if heading in NUMBER_COLUMNS else ' style="text-align:left"' for heading in PARAMETER_HEADINGS]
-        return '<tr>' + ''.join(f'<{tag}{s}>{escape(cell)}</{tag}>' for cell, s in zip(cells, style, strict=True)) + '</tr>'
-    body = ''.join(row(cells, 'td') for cells in parameter_rows(calibration))
-    return f'<table><caption>{escape(summary(calibration))}</caption>{row(PARAMETER_HEADINGS, "th")}{body}</table>'
 
 
 READINGS = {'accelerometer': {'force'}, 'gyroscope': {'rate', 'angular acceleration'}}
@@ -263,22 +246,11 @@ HAND_AXES = 'accelerometer_lower_triangular'
 """The axes of a calibration by hand."""
 
 
-
-
 def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:
     """Return kind of window -> ratio of the residual variance of the sensor to that of its noise and of errors of the stamps."""
     chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
     by_stamps = (calibration.statistics.get('stamp_jitter') or {}).get('variance_ratio', {}).get(sensor, {})
     return {kind: ratio / by_stamps.get(kind, 1.0) for kind, ratio in chi2.items() if kind != 'means'}
-
-
-def quiet(calibration: Calibration) -> str:
-    """
-    Return the name of the reference that residuals in motion are compared with.
-
-    Without a rest it is their slow part; lags are visible in the fast part.
-    """
-    return 'the noise at rest' if rested(calibration) else 'their slow part (as after a lag or a late clock)'
 
 
 def rested(calibration: Calibration) -> bool:
@@ -296,8 +268,6 @@ def listed(names: Sequence[str]) -> str:
         groups.setdefault(name.rpartition('.')[0], []).append(name.rpartition('.')[2])
     return ', '.join(f'{group} ({len(members)}: {", ".join(members)})' for group, members in groups.items())
 
-
-LOOK_FOR = {'reference': 'the literature values of tables: check the description of the table, the mount, the stamps'}
 
 MIN_COEFFICIENT_SDS = 3.0
 """Standard deviations by which one coefficient of an effect must differ from its prior for the effect to be added."""
@@ -338,8 +308,9 @@ def true_calibration(model: SensorModel, values: np.ndarray, frame_id: str, *, s
 
 def beyond_known(share: float, section: str) -> str:
     """Return the message for an effect that explains a share of the excess variance with a size that no known instrument has."""
-    return (f'explains {100 * share:.0f} % of the residual, but its size exceeds '
-            f'{LOOK_FOR.get(section, "the literature values of such sensors: check saturation, the mount, the scale")}')
+    of_what = ('of tables: check the description of the table, the mount, the stamps' if section == 'reference' else
+               'of such sensors: check saturation, the mount, the scale')
+    return f'explains {100 * share:.0f} % of the residual, but its size exceeds the literature values {of_what}'
 
 
 def implausible(calibration: Calibration, sensor: str | None = None) -> list[str]:

@@ -36,7 +36,6 @@ HELPS, UNPROVEN, HARMS = SensorDecision
 BY_DEFINITION: dict[str, Any] = {'decision': dict.fromkeys(SENSORS, str(HELPS)),
                                  'decision_reasons': dict.fromkeys(SENSORS, 'the true parameters of a simulation')}
 """Fields of the Calibration with which a session was simulated."""
-_CAUTION = (HELPS, UNPROVEN, HARMS)
 
 
 def decide(entry: Mapping | None) -> SensorDecision:
@@ -49,7 +48,7 @@ def decide(entry: Mapping | None) -> SensorDecision:
 
 def most_cautious(decisions: Iterable[SensorDecision]) -> SensorDecision:
     """Return the worst of several decisions; HELPS without any."""
-    return max(decisions, key=_CAUTION.index, default=HELPS)
+    return max(decisions, key=list(SensorDecision).index, default=HELPS)
 
 
 def decisions_text(decisions: Mapping[str, SensorDecision]) -> str:

@@ -15,7 +15,6 @@ from imu_calibration.document.calibration import (
     implausible,
     listed,
     misfit_ratios,
-    quiet,
     rested,
 )
 from imu_calibration.document.decision import (
@@ -122,13 +121,21 @@ def _with_size(calibration, name):
 
 
 def misfits(calibration: Calibration) -> list[Reason]:
-    """Return the residuals above the noise at rest: notes, or warnings where they are far above; diagnoses use the same test."""
-    return [Reason(WARNING if ratio > MAX_MISFIT_RATIO else NOTE,
-                   f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times {quiet(calibration)}: '
-                   f'the model is incomplete{", although the calibration helps in each regime" if helps else ""}',
-                   'find the cause', key='diagnose', sensors=(sensor,))
-            for sensor in SENSORS for helps in [rested(calibration) and helps_everywhere(calibration.proof.get(sensor))]
-            for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > NOTED_MISFIT]
+    """
+    Return the residuals in motion above the noise at rest: notes, or warnings where they are far above; diagnoses use the same test.
+
+    Without a rest they are compared with their slow part; lags are visible in the fast part.
+    """
+    at_rest = rested(calibration)
+    reference = 'the noise at rest' if at_rest else 'their slow part (as after a lag or a late clock)'
+    reasons = []
+    for sensor in SENSORS:
+        more = ', although the calibration helps in each regime' if at_rest and helps_everywhere(calibration.proof.get(sensor)) else ''
+        reasons += [Reason(WARNING if ratio > MAX_MISFIT_RATIO else NOTE, f'the {sensor} residuals of {kind} windows are '
+                           f'{np.sqrt(ratio):.1f} times {reference}: the model is incomplete{more}', 'find the cause', key='diagnose',
+                           sensors=(sensor,))
+                    for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > NOTED_MISFIT]
+    return reasons
 
 
 def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:

@@ -31,8 +31,7 @@ another session to replace it, and without a file the node has no other source.
 class CompensatorSettings:
     """Calibration, target frame and options of the compensation."""
 
-    calibration_file: str = setting('', '', 'calibration.yaml to correct with, read again on ~/reload; '
-                                    'empty: wait for imu/calibration',
+    calibration_file: str = setting('', '', 'calibration.yaml to correct with, read again on ~/reload; empty: wait for imu/calibration',
                                     symptom='no messages are published, see diagnostics', session=True, path=True)
     wait_for_file: bool = setting(False, '', 'wait for calibration_file while it does not exist', symptom='the node ends at its start')
     adopt: str = setting(FILE_THEN_TOPIC, '', 'source of calibrations; file: calibration_file only, for the field; '
@@ -63,18 +62,15 @@ class CompensatorSettings:
                               'covariances follow from it where the messages bring none; empty: '
                               'from the noise that the calibration saw', symptom='filters trust the readings too much or too little',
                               session=True, path=True)
-    covariance_rate: float = setting(1.0, 'Hz', 'rate of updates of the covariances at the present motion; '
-                                     '0: only with a new calibration',
+    covariance_rate: float = setting(1.0, 'Hz', 'rate of updates of the covariances at the present motion; 0: only with a new calibration',
                                      (0.0, 100.0), 'too small: covariances lag behind fast turns; too large: computing time', live=True)
-    gravity: float = setting(0.0, 'm/s^2', 'gravity at the site of the robot, for the test of the calibration at stops; '
-                             '0: that of the calibration, within '
-                             'the half per cent of variation between sites',
+    gravity: float = setting(0.0, 'm/s^2', 'gravity at the site of the robot, for the test of the calibration at stops; 0: that of the '
+                             'calibration, within the half per cent of variation between sites',
                              (0.0, 20.0), 'an error of a scale below half a per cent is not detected',
                              live=True)
     update_gyro_bias: bool = setting(False, '', 'correct the residual bias of the gyroscope measured at stops',
-                                     symptom='headings drift as the sensor warms up; '
-                                     'if true where the robot turns slowly and steadily at "rest", that '
-                                     'rotation counts as a bias', live=True)
+                                     symptom='headings drift as the sensor warms up; if true where the robot turns slowly and steadily at '
+                                     '"rest", that rotation counts as a bias', live=True)
     gyro_bias_time: float = setting(600.0, 's', 'in which such an update loses its meaning while the robot does not stop', (10.0, 86400.0),
                                     'too long: the bias of long ago is believed; too short: it is forgotten between stops', live=True)
     public_executor: bool = setting(False, '', "use rclpy's public executor, at two to four times the computing time, "
@@ -169,9 +165,8 @@ def _transfer(calibration: Calibration, settings: CompensatorSettings, frames: S
     if not target or given or target == calibration.frame_id:
         return requested_transfer(target, settings.target_xyz, settings.target_rpy)
     if not calibration.frame_id:
-        raise DocumentError(f"to move readings to '{target}' by {TF_STATIC} the calibration must name the frame of the sensor, "
-                            "it names none; give "
-                            'target_xyz and target_rpy')
+        raise DocumentError(f"to move readings to '{target}' by {TF_STATIC} the calibration must name the frame of the sensor, it names "
+                            "none; give target_xyz and target_rpy")
     pose = frames.pose(target, calibration.frame_id)
     if pose is None:
         raise Awaited(frames.waits_for(target, calibration.frame_id))

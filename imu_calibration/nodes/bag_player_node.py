@@ -87,8 +87,7 @@ class BagPlayerNode(Node):
             if _message_class(self._bag.types[name]) is not None:
                 chosen.append(name)
             elif asked:
-                raise InputError(f'the type {self._bag.types[name]} of {name} must be installed to be played, it is not; '
-                                 'omit the topic')
+                raise InputError(f'the type {self._bag.types[name]} of {name} must be installed to be played, it is not; omit the topic')
             else:
                 self.get_logger().warning(f'{name} is left out: its type {self._bag.types[name]} is not installed')
         if not chosen:

@@ -74,17 +74,15 @@ class CalibrationNodeSettings:
     tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
                                    symptom='good parameters are called weak', session=True, path=True)
     effects_file: str = setting('', '', 'own effects in addition to the catalogue, path: YAML with effects: NAME: {sensor, column, unit, '
-                                'tolerance, text}, '
-                                'or a calibration with own effects; a model may then name them',
+                                'tolerance, text}, or a calibration with own effects; a model may then name them',
                                 symptom='the node refuses a model that names them',
                                 session=True, path=True, fixed='motion is gathered for the model')
     noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: motion of its biases between windows, on a table; '
                               'empty: estimated from the windows', symptom='standard deviations of the biases are too large or too small',
                               session=True, path=True, fixed='one session is judged by one noise')
     save_file: str = setting('', '', 'file of ~/save for the calibration; the accumulator is NAME.accumulator.npz in the same folder, '
-                             'written also when '
-                             'the node ends with unsaved motion; empty: calibration.yaml in the working directory, '
-                             'by ~/save only',
+                             'written also when the node ends with unsaved motion; empty: calibration.yaml in the working directory, by '
+                             '~/save only',
                              symptom='the node reports at its start that the folder is not writable', session=True, path=True)
     serial: str = setting('', '', 'serial number of the IMU, for the calibration', session=True,
                           symptom='calibrations of several units are not distinguished')

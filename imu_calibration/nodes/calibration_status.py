@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -149,27 +149,26 @@ def advice_of(state: WorkerState) -> str:
     return next(iter([*steps, *(group.needs for group in state.groups if group.needs)]), '')
 
 
-_STREAM_LEVELS = {'good': OK, 'trouble': WARN, 'silent': ERROR}
-_GROUP_LEVELS = {'determined': OK, 'weak': WARN, 'held': WARN, 'waiting': OK}
-_HAND_LEVELS = {'waiting': OK, 'weak': WARN, 'determined': OK}
-_DIAGNOSIS_LEVELS = {'nothing found': OK, 'off': OK, 'waiting': OK, 'found': WARN, 'unexplained': WARN, 'failed': ERROR}
-_DECISION_LEVELS = {'': OK, 'helps': OK, 'unproven': WARN, 'harms': ERROR}
+LEVELS = {word: level for level, words in (
+    (OK, ('good', 'determined', 'waiting', 'nothing found', 'off', '', 'helps')),
+    (WARN, ('trouble', 'weak', 'held', 'found', 'unexplained', 'unproven')), (ERROR, ('silent', 'failed', 'harms'))) for word in words}
+"""Word of a stream, a parameter group, a session, a diagnosis or a decision -> its level."""
 
 
 def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
     """Return the DiagnosticStatus messages of a WorkerState; `stream_faults` are lines about its topics."""
     found = []
     if state.streams is not None:
-        level = max(_STREAM_LEVELS[state.streams.word], WARN if stream_faults else OK)
+        level = max(LEVELS[state.streams.word], WARN if stream_faults else OK)
         found.append(make_status(level, 'streams', '; '.join([state.streams.message, *stream_faults]), values=state.streams.values))
     parts = [state.judged or state.verdict or 'waiting for motion', *state.lines[:3], *[state.trouble] * bool(state.trouble), *state.faults]
     incomplete = WARN if state.verdict and (state.trouble or not state.complete) else OK
-    level = ERROR if state.faults else max(_DECISION_LEVELS[state.verdict], incomplete)
+    level = ERROR if state.faults else max(LEVELS[state.verdict], incomplete)
     found.append(make_status(level, 'calibration', '; '.join(dict.fromkeys(parts)), values={'version': state.solution, **state.values}))
     if state.session is not None:
-        found.append(make_status(_HAND_LEVELS[state.session.word], 'poses', state.session.message, values=state.session.values))
+        found.append(make_status(LEVELS[state.session.word], 'poses', state.session.message, values=state.session.values))
     if state.diagnosis is not None:
-        found.append(make_status(_DIAGNOSIS_LEVELS[state.diagnosis.word], 'diagnosis', state.diagnosis.message,
+        found.append(make_status(LEVELS[state.diagnosis.word], 'diagnosis', state.diagnosis.message,
                                  values={'outcome': state.diagnosis.word, **state.diagnosis.values}))
     return found + [_group_status(group) for group in state.groups]
 
@@ -183,7 +182,7 @@ def _group_status(group: GroupState):
                f'predicted after that motion [{group.unit}]': group.predicted_sd}
     values = {'parameter': group.parameter, 'needs': group.needs,
               **{name: f'{figure:.3g}' for name, figure in figures.items() if not math.isnan(figure)}}
-    return make_status(_GROUP_LEVELS[group.status], f'{group.sensor} {group.effect}', text, values=values)
+    return make_status(LEVELS[group.status], f'{group.sensor} {group.effect}', text, values=values)
 
 
 def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
@@ -193,71 +192,48 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     Cells: orange and large where another rest is informative, green and small elsewhere. An arrow from the present up direction to the
     next one, a ring of the turn between them; blue points: earlier up directions; the arms of the three sensitive points; one line of text.
     """
-    frame = coverage.frame_id or 'imu_link'
-    arrows = [_arrow(*each, number=k) for k, each in enumerate(arrows_of(coverage))]
-    made = [_marker('all', 0, Marker.SPHERE), *_cells(coverage), *_seen(coverage), *arrows, *_turn(coverage), _text(coverage)]
-    made[0].action = Marker.DELETEALL
-    for marker in made:
-        marker.header.frame_id, marker.header.stamp = frame, stamp
-    return MarkerArray(markers=made)
+    made = [Marker(ns='all', action=Marker.DELETEALL)]
+    made += [_marker('cells', k, Marker.SPHERE, color=(*color, 0.9), scale=(size,) * 3, place=place)
+             for k, (place, color, size) in enumerate(cells_of(coverage))]
+    if len(coverage.seen):
+        made.append(_marker('seen', 0, Marker.SPHERE_LIST, color=VISITED, scale=(SEEN_DIAMETER,) * 3, points=1.1 * RADIUS * coverage.seen))
+    made += [_arrow(*each, number=k) for k, each in enumerate(arrows_of(coverage))]
+    step = coverage.next
+    if step.axis is not None and coverage.up is not None and step.up is not None:
+        across, angles = np.cross(step.axis, coverage.up), np.linspace(0, step.angle, 24)[:, None]
+        made.append(_marker('turn', 0, Marker.LINE_STRIP, color=(*ARROW, 0.7), scale=(0.012, 0.0, 0.0),
+                            points=0.7 * RADIUS * (np.cos(angles) * coverage.up - np.sin(angles) * across)))
+    made.append(_marker('text', 0, Marker.TEXT_VIEW_FACING, color=DONE_COLOUR if coverage.done else TEXT_COLOUR, scale=(0.0, 0.0, 0.09),
+                        place=(0.0, 0.0, 1.6 * RADIUS), text=line_of(coverage)))
+    return _stamped(made, coverage.frame_id, stamp)
 
 
 def driven_markers(up: np.ndarray, text: str, *, frame_id: str, stamp: Time) -> MarkerArray:
     """Return the planner's markers: an arrow to the up direction after the driven motion, and a description of that motion."""
-    made = [_arrow('driven', np.zeros(3), 1.25 * RADIUS * up, ARROW), _marker('driven', 1, Marker.TEXT_VIEW_FACING, scale=(0.0, 0.0, 0.08))]
-    made[1].text = text
-    _at(made[1], (0.0, 0.0, -1.5 * RADIUS))
-    for marker in made:
+    return _stamped([_arrow('driven', np.zeros(3), 1.25 * RADIUS * up, ARROW),
+                     _marker('driven', 1, Marker.TEXT_VIEW_FACING, color=TEXT_COLOUR, scale=(0.0, 0.0, 0.08),
+                             place=(0.0, 0.0, -1.5 * RADIUS), text=text)], frame_id, stamp)
+
+
+def _stamped(markers, frame_id, stamp):
+    for marker in markers:
         marker.header.frame_id, marker.header.stamp = frame_id or 'imu_link', stamp
-    return MarkerArray(markers=made)
-
-
-def _marker(name, number, kind, *, color=TEXT_COLOUR, alpha=1.0, scale=(1.0, 1.0, 1.0)):
-    marker = Marker(ns=name, id=number, action=Marker.ADD, color=ColorRGBA(r=color[0], g=color[1], b=color[2], a=alpha))
-    marker.type = kind
-    marker.scale.x, marker.scale.y, marker.scale.z = map(float, scale)
-    marker.pose.orientation.w = 1.0
-    return marker
-
-
-def _at(marker, place):
-    marker.pose.position = _point(place)
-    return marker
-
-
-def _point(place):
-    return Point(x=float(place[0]), y=float(place[1]), z=float(place[2]))
-
-
-def _cells(coverage):
-    for k, (place, color, size) in enumerate(cells_of(coverage)):
-        yield _at(_marker('cells', k, Marker.SPHERE, color=color, alpha=0.9, scale=(size,) * 3), place)
-
-
-def _seen(coverage):
-    if len(coverage.seen):
-        marker = _marker('seen', 0, Marker.SPHERE_LIST, color=VISITED, scale=(SEEN_DIAMETER,) * 3)
-        marker.points = [_point(1.1 * RADIUS * up) for up in coverage.seen]
-        yield marker
-
-
-def _turn(coverage):
-    step = coverage.next
-    if step.axis is not None and coverage.up is not None and step.up is not None:
-        ring = _marker('turn', 0, Marker.LINE_STRIP, color=ARROW, alpha=0.7, scale=(0.012, 0.0, 0.0))
-        angles = np.linspace(0, step.angle, 24)
-        across = np.cross(step.axis, coverage.up)
-        ring.points = [_point(0.7 * RADIUS * (np.cos(a) * coverage.up - np.sin(a) * across)) for a in angles]
-        yield ring
+    return MarkerArray(markers=markers)
 
 
 def _arrow(name, start, end, color, number=0):
-    marker = _marker(name, number, Marker.ARROW, color=color, scale=(0.025, 0.05, 0.07))
-    marker.points = [_point(start), _point(end)]
-    return marker
+    return _marker(name, number, Marker.ARROW, color=color, scale=(0.025, 0.05, 0.07), points=(start, end))
 
 
-def _text(coverage):
-    marker = _marker('text', 0, Marker.TEXT_VIEW_FACING, color=DONE_COLOUR if coverage.done else TEXT_COLOUR, scale=(0.0, 0.0, 0.09))
-    marker.text = line_of(coverage)
-    return _at(marker, (0.0, 0.0, 1.6 * RADIUS))
+def _marker(name, number, kind, *, color, scale, place=(0.0, 0.0, 0.0), points=(), text=''):
+    """Return a marker; the fourth number of a colour is its opacity."""
+    red, green, blue, opacity = map(float, (*color, 1.0)[:4])
+    x, y, z = map(float, scale)
+    return Marker(ns=name, id=number, type=kind, action=Marker.ADD, color=ColorRGBA(r=red, g=green, b=blue, a=opacity),
+                  scale=Vector3(x=x, y=y, z=z), pose=Pose(position=_point(place), orientation=Quaternion(w=1.0)),
+                  points=[_point(point) for point in points], text=text)
+
+
+def _point(place):
+    x, y, z = map(float, place)
+    return Point(x=x, y=y, z=z)

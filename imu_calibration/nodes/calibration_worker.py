@@ -222,8 +222,7 @@ class CalibrationWorker(threading.Thread):
             return False, "a diagnosis is not available by hand, and not if parameter 'diagnosis_period' is 0"
         self._publish_solution(pending=True)
         self._diagnosis.want(urgent=True)
-        return True, (f'diagnosis of {self.live.n_windows} windows started; '
-                      'its result is published on /diagnostics and in the calibration')
+        return True, f'diagnosis of {self.live.n_windows} windows started; its result is published on /diagnostics and in the calibration'
 
     def _save(self) -> tuple[bool, str]:
         text, what = None, ''

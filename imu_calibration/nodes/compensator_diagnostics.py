@@ -25,14 +25,13 @@ ANOTHER_RATE = 0.1
 COLD = 10.0
 """Seconds without a temperature after which diagnostics report it; drivers send one per second."""
 HEALTH_LEVELS = {WAITING: OK, HOLDS: OK, FOLLOWED: OK, MOVED: WARN, HARMS: ERROR, UNIT: ERROR}
-TEXT_OF_REASON = {'no temperature yet': 'the calibration has thermal effects and no temperature was received: no messages are published',
-         'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
-         'not finite': 'readings are not finite: these messages are not published',
-         'covariance not finite': ("received covariances are invalid (not finite, or a variance below zero): "
-                                   "the calibration's noise is used"),
-         'zero stamp': ('the stamps of the driver are zero: '
-                        'times of arrival are used for the angular acceleration'),
-         'outside the invertible range': 'readings are outside the range in which the non-linear effects can be inverted: not published'}
+TEXT_OF_REASON = {
+    'no temperature yet': 'the calibration has thermal effects and no temperature was received: no messages are published',
+    'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
+    'not finite': 'readings are not finite: these messages are not published',
+    'covariance not finite': "received covariances are invalid (not finite, or a variance below zero): the calibration's noise is used",
+    'zero stamp': 'the stamps of the driver are zero: times of arrival are used for the angular acceleration',
+    'outside the invertible range': 'readings are outside the range in which the non-linear effects can be inverted: not published'}
 
 
 class CompensatorDiagnostics:

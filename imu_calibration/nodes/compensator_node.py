@@ -85,7 +85,7 @@ class CompensatorNode(Node):
             self._waiting = every(self, LOOK_FOR_FILE, self._guarded(self._look_for_file))
             self.get_logger().info(f'waits for the file {path}')
         elif self.settings.calibration_file:
-            self._try("parameter 'calibration_file'", self._load_file, self.settings)
+            self._try_file()
         else:
             self.get_logger().info(f'waiting for a calibration on {self.documents.topic_name}' if self.settings.takes_topic else
                                    "waiting for parameter 'calibration_file'")
@@ -93,7 +93,7 @@ class CompensatorNode(Node):
     def _look_for_file(self) -> None:
         if files.user_path(self.settings.calibration_file).exists():
             self.destroy_timer(self._waiting)
-            self._try("parameter 'calibration_file'", self._load_file, self.settings)
+            self._try_file()
 
     @property
     def compensation(self) -> LiveCompensation | None:
@@ -150,7 +150,7 @@ class CompensatorNode(Node):
             return
         self._heard = message.data
         if self.settings.takes_topic:
-            self._try(self._topic, self._take_topic, self.settings)
+            self._try(self._topic, self._take_topic)
         else:
             self.complaints.event(f"a calibration on {self.documents.topic_name} was not adopted: parameter 'adopt' is "
                                   f"'{self.settings.adopt}' and 'calibration_file' is '{self.settings.calibration_file}'")
@@ -202,10 +202,13 @@ class CompensatorNode(Node):
         path = files.user_path(settings.calibration_file)
         self._adopt(files.read_text(path, 'calibration'), f'file {path}', settings)
 
-    def _try(self, source: str, action: Callable, *arguments: Any) -> str:
-        """Run an action; return the reason of its refusal, '' when it succeeded."""
+    def _try_file(self) -> str:
+        return self._try("parameter 'calibration_file'", self._load_file)
+
+    def _try(self, source: str, action: Callable[[CompensatorSettings], None]) -> str:
+        """Adopt a calibration with the present settings; return the reason of its refusal, '' when it succeeded."""
         try:
-            action(*arguments)
+            action(self.settings)
             return ''
         except Awaited as awaited:
             self.awaited = str(awaited)
@@ -229,13 +232,13 @@ class CompensatorNode(Node):
 
     def _retry(self) -> None:
         if self.settings.takes_topic and self._heard:
-            self._try(self._topic, self._take_topic, self.settings)
+            self._try(self._topic, self._take_topic)
         elif self.settings.calibration_file:
-            self._try("parameter 'calibration_file'", self._load_file, self.settings)
+            self._try_file()
 
     def _on_reload(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self.settings.calibration_file:
-            why = self._try("parameter 'calibration_file'", self._load_file, self.settings)
+            why = self._try_file()
         else:
             why = "parameter 'calibration_file' is empty; start the node with the file to read again"
         response.success, response.message = not why, why or (self.adopted.line() if self.adopted else '')

@@ -46,7 +46,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 HEARD = 0.1
 """Seconds within which the interpreter has heard of a signal; rclpy hears first, and ends the context."""
 LOOK_AGAIN = 0.5
-"""Seconds after which an idle node checks whether its end was requested."""
+"""Interval at which an idle node checks whether its end was requested, s."""
 
 
 def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = None, *, spin: Callable[[Any], None] | None = None,
@@ -99,7 +99,8 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
         node = make_node()
         for line in unknown_parameters(node):
             node.get_logger().warning(line)
-        _look_again(node)
+        # At a signal rclpy wakes the executor before it ends the context: an executor that checks the context in between waits again.
+        every(node, LOOK_AGAIN, lambda: None)
         if not asked_to_end:   # an executor cannot be made any more
             (spin or rclpy.spin)(node)
     except (ExternalShutdownException, KeyboardInterrupt):
@@ -114,16 +115,6 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
     finally:
         _end(node)
     return int(getattr(node, 'failed', False))
-
-
-def _look_again(node: Any) -> None:
-    """
-    Wake the executor periodically.
-
-    At a signal rclpy wakes the executor first and ends the context second: an executor that checks the context in between waits again, and
-    no event would wake it any more.
-    """
-    every(node, LOOK_AGAIN, lambda: None)
 
 
 def _failed(line: str) -> int:

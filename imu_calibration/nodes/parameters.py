@@ -1,10 +1,9 @@
-"""Parameters of a node from its settings, and the parameter files in config."""
+"""Parameters of a node from its settings."""
 
 import ast
 import importlib
 import json
 import sys
-import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -28,6 +27,8 @@ NOT_OURS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 """Beginnings of the parameters that rclpy itself has."""
 
 
+TYPE_NAMES = {bool: 'true or false', int: 'a whole number', float: 'a number with a decimal point', str: 'a text',
+              tuple: 'a list of numbers with decimal points'}
 _GROUPS = '_imu_calibration_groups'
 """Attribute of a node that holds its groups."""
 
@@ -59,9 +60,11 @@ def declare_parameters(node: Node, group: type, take: Callable[[Any], None] | No
     values = {}
     for item in describe(group):
         try:
-            value = node.declare_parameter(item.name, _to_ros(item.default), parameter_descriptor(item)).value
+            value = node.declare_parameter(item.name, list(item.default) if isinstance(item.default, tuple) else item.default,
+                                           parameter_descriptor(item)).value
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            raise InputError(f"parameter '{item.name}' must be {_type_name(item.default)}{range_text(item.bounds)}: {error}") from error
+            kind = TYPE_NAMES[type(item.default)]
+            raise InputError(f"parameter '{item.name}' must be {kind}{range_text(item.bounds)}: {error}") from error
         values[item.name] = _from_ros(item, value)
     settings = override(group(), values)
     _watch(node, _Group(settings, take, hints or {}))
@@ -158,17 +161,8 @@ def _limits(bounds: tuple, largest: float) -> tuple:
     return -largest if low is None else low, largest if high is None else high
 
 
-def _to_ros(default: Any) -> Any:
-    return list(default) if isinstance(default, tuple) else default
-
-
 def _from_ros(item: Setting, value: Any) -> Any:
     return tuple(value) if isinstance(item.default, tuple) else value
-
-
-def _type_name(default: Any) -> str:
-    return {bool: 'true or false', int: 'a whole number', float: 'a number with a decimal point', str: 'a text',
-            tuple: 'a list of numbers with decimal points'}[type(default)]
 
 
 _ARM = {'allow_xacro': "parameter 'allow_xacro'", 'urdf': "parameter 'urdf_file'", 'imu_link': "parameter 'imu_link'"}
@@ -186,37 +180,12 @@ HINTS = {
 """Node -> {key of `errors.KEYS`: its name in the node}; a node without an entry receives no such error."""
 
 
-NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
-
-
-def main(folder: Path = Path(__file__).resolve().parents[2] / 'config') -> None:
-    """Write one file for each node, and print which have changed."""
-    for node in NODES:
-        path = folder / f'{node}.yaml'
-        text = rendered(node)
-        if not path.exists() or path.read_text() != text:
-            path.write_text(text)
-            print(f'written: {path}')
-
-
 def settings_of(node: str) -> list[type]:
     """Return the settings classes that the module of `node` declares as parameters."""
     tree = ast.parse(Path(__file__).with_name(f'{node}.py').read_text())
     calls = [call for call in ast.walk(tree) if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'declare_parameters']
     module = importlib.import_module(f'imu_calibration.nodes.{node}')
     return [getattr(module, ast.unparse(call.args[1])) for call in sorted(calls, key=lambda call: call.lineno)]
-
-
-def rendered(node: str) -> str:
-    """Return the text of the parameter file of `node`."""
-    lines = [f'# Parameters of {node} with their defaults: meaning [unit], range, and symptoms of a wrong value.', '/**:',
-             '  ros__parameters:']
-    for group in settings_of(node):
-        for item in describe(group):
-            words = meaning(item) + (f'. When wrong: {item.symptom}' if item.symptom else '')
-            lines += textwrap.wrap(words, 120, initial_indent='    # ', subsequent_indent='    # ')
-            lines.append(f'    {"# " if item.session else ""}{item.name}: {value_text(item.default)}')
-    return '\n'.join(lines) + '\n'
 
 
 def meaning(item: Setting) -> str:
@@ -238,7 +207,3 @@ def value_text(value: object) -> str:
         return '[' + ', '.join(map(value_text, value)) + ']'
     text = json.dumps(value)
     return text.replace('e', '.0e') if isinstance(value, float) and 'e' in text and '.' not in text else text
-
-
-if __name__ == '__main__':
-    main()

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -37,7 +37,7 @@ from imu_calibration.kinematics.motion_limits import (
 )
 from imu_calibration.nodes.calibration_status import driven_markers
 from imu_calibration.nodes.complaints import LOG_ERROR, LOG_INFO, Complaints, say
-from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
+from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.inputs import BatchInput, MatchedInput, latched_qos, watch_inputs
 from imu_calibration.nodes.joint_commands import OtherDrivers, make_command
 from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node
@@ -343,24 +343,20 @@ class PlannerNode(Node):
     def _statuses(self) -> list:
         if self._driven is not None:   # again, because calibration_node's markers begin with DELETEALL
             self._coverage.publish(self._driven)
-        return drive_statuses(self.driver, self.worker, self._command.name, faults=self._joints.faults() + self._calibrations.faults())
-
-
-def drive_statuses(driver: Driver, worker: PlannerWorker, commands: str, *, faults: list[str]) -> list:
-    """Return the DiagnosticStatus of the drive; `commands`: topic or action of the trajectories, `faults`: lines about the inputs."""
-    name, excess = worker.worst
-    values = {'state': driver.state.value, 'motion': driver.motions, 'of it driven [s]': f'{driver.progress:.1f}',
-              'it takes [s]': f'{worker.seconds:.1f}', 'elapsed [s]': f'{worker.elapsed:.1f}', 'outside tolerance': worker.outside,
-              'furthest outside': name, 'standard deviation over tolerance': f'{excess:.2f}', 'commands': commands,
-              'ignored joint states': ' '.join(f'{name}:{count}' for name, count in driver.ignored.items())}
-    if worker.campaign is not None and worker.campaign.findings is not None:
-        values |= {'found': ' '.join(finding.effect for finding in worker.campaign.findings),
-                   'mates': ' '.join(mate for finding in worker.campaign.findings for mate in finding.mates),
-                   'separations': worker.campaign.separations, 'separating': worker.campaign.is_separating,
-                   'told apart': ' '.join(worker.campaign.told_apart)}
-    text = '; '.join([worker.doing or f'{driver.state}: {driver.reason}', *faults])
-    level = DiagnosticStatus.ERROR if driver.state == DriveState.STOPPED else WARN if faults else OK
-    return [make_status(level, 'drive', text, values=values)]
+        driver, worker, campaign = self.driver, self.worker, self.worker.campaign
+        name, excess = worker.worst
+        values = {'state': driver.state.value, 'motion': driver.motions, 'of it driven [s]': f'{driver.progress:.1f}',
+                  'it takes [s]': f'{worker.seconds:.1f}', 'elapsed [s]': f'{worker.elapsed:.1f}', 'outside tolerance': worker.outside,
+                  'furthest outside': name, 'standard deviation over tolerance': f'{excess:.2f}', 'commands': self._command.name,
+                  'ignored joint states': ' '.join(f'{name}:{count}' for name, count in driver.ignored.items())}
+        if campaign is not None and campaign.findings is not None:
+            values |= {'found': ' '.join(finding.effect for finding in campaign.findings),
+                       'mates': ' '.join(mate for finding in campaign.findings for mate in finding.mates),
+                       'separations': campaign.separations, 'separating': campaign.is_separating,
+                       'told apart': ' '.join(campaign.told_apart)}
+        faults = self._joints.faults() + self._calibrations.faults()
+        level = ERROR if driver.state == DriveState.STOPPED else WARN if faults else OK
+        return [make_status(level, 'drive', '; '.join([worker.doing or f'{driver.state}: {driver.reason}', *faults]), values=values)]
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -86,10 +86,9 @@ Found = TypeVar('Found')
 class RobotSettings:
     """The arm that carries the IMU."""
 
-    urdf_file: str = setting('', '', "description (.urdf, or .xacro with allow_xacro) of the arm that carries the IMU, path; "
-                             f"{URDF_FROM_TOPIC}: the topic robot_description; empty: "
-                             'table_file only. With an arm, table_file describes the site: up, gravity, latitude, '
-                             'limits of joints by name',
+    urdf_file: str = setting('', '', 'description (.urdf, or .xacro with allow_xacro) of the arm that carries the IMU, path; '
+                             f'{URDF_FROM_TOPIC}: the topic robot_description; empty: table_file only. With an arm, table_file describes '
+                             'the site: up, gravity, latitude, limits of joints by name',
                              symptom='the node waits for the missing input', session=True, path=True,
                              fixed='all motion gathered so far is of that arm')
     imu_link: str = setting('', '', 'link of the arm that carries the IMU; empty: the frame_id of its messages',

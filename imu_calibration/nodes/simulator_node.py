@@ -50,8 +50,7 @@ trajectory is effective about half a second later."""
 class SimulatorSettings:
     """The table, its motion, the IMU and the pace."""
 
-    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_simulated.yaml, '
-                              'or none with urdf_file',
+    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_simulated.yaml, or none with urdf_file',
                               symptom='joint names differ from the expected ones', session=True, path=True)
     profile: str = setting('quick', '',
                            "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until "

@@ -76,7 +76,8 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
     questions = len(model.catalogue.effects(model.joint_names))
     problem.goal = ToldApart(coordinates, suspected(problem, causes, table, sizes=sizes or {}), questions)
     names = {name: k for k, name in enumerate(calibration.param_names) if k not in _indices(calibration.model, first)}
-    return Planner(problem, coordinates.information_from(names, calibration.covariance))
+    problem.known = coordinates.information_from(names, calibration.covariance)
+    return Planner(problem)
 
 
 def suspected(problem: PlanningProblem, causes: Sequence[tuple[str, str]], table: Table, *,
@@ -126,8 +127,7 @@ def _places(coordinates, key):
 def _require_shown_by_motion(model, key):
     effect = model.catalogue.find(*key, model.joint_names)
     if special(effect) or effect.smooth or 'temperature' in effect.needs:
-        raise InputError(f"effects that motion separates must depend on it, '{key[1]}' depends on time, temperature or range; "
-                         'omit it')
+        raise InputError(f"effects that motion separates must depend on it, '{key[1]}' depends on time, temperature or range; omit it")
 
 
 TIME_OVER = 'the time given is over'

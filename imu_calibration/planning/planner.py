@@ -58,8 +58,7 @@ class CandidateMotions:
         return int(np.argmax(np.where(self.possible, self.gain / np.maximum(self.seconds, 1e-9), -np.inf)))
 
 
-def greedy(problem: PlanningProblem, start: int, *, known: np.ndarray | None = None, first: Sequence[int] = (),
-           longest: float = np.inf) -> list[int]:
+def greedy(problem: PlanningProblem, start: int, *, first: Sequence[int] = (), longest: float = np.inf) -> list[int]:
     """
     Return motions that reach the goal, or the smallest distance to it, each with the best gain per second at its step.
 
@@ -68,20 +67,18 @@ def greedy(problem: PlanningProblem, start: int, *, known: np.ndarray | None = N
     problem : PlanningProblem
     start : int
         Place where the joints are.
-    known : ndarray, optional
-        Information about z in addition to the prior.
     first : sequence of int
         Mandatory first motions.
     longest : float
         Time at most, s.
 
     """
-    posterior, place, chosen, spent, margin, factor = problem.posterior(known), start, [], 0.0, 1.0, 0.0
+    posterior, place, chosen, spent, margin, factor = problem.posterior(), start, [], 0.0, 1.0, 0.0
     taken: list[tuple[np.ndarray, float]] = []
     beginning = problem.goal.left(posterior.known[None])[0]
     while len(chosen) < MAX_PLAN_MOTIONS and spent < longest:
-        if factor != (factor := problem.variance_factor(problem.timed(chosen, start)[0], known)):
-            posterior = problem.posterior(known)
+        if factor != (factor := problem.variance_factor(problem.timed(chosen, start)[0])):
+            posterior = problem.posterior()
             for information, seconds in taken:
                 posterior.take(information / factor, seconds)
         choice = CandidateMotions(problem, posterior, place, margin=margin, factor=factor)
@@ -97,28 +94,24 @@ def greedy(problem: PlanningProblem, start: int, *, known: np.ndarray | None = N
         left = problem.goal.left(posterior.known[None], margin)[0]
         report('planning', 1.0 - left / max(beginning, 1e-9), 1.0)
         if left == 0.0 and len(chosen) >= len(first):
-            if meets(problem, chosen, start, known=known):
+            if remaining(problem, chosen, start) == 0.0:
                 break
             # The belief has constant biases within a motion; if that was optimistic, the target must be lower.
             margin *= FURTHER
     return chosen
 
 
-def meets(problem: PlanningProblem, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None) -> bool:
-    """Return whether motions reach the goal."""
-    return bool(problem.goal.left(problem.covariance_after(sequence, start, known, cautious=True)[0][None])[0] == 0.0)
+def remaining(problem: PlanningProblem, sequence: Sequence[int], start: int) -> float:
+    """Return the distance to the goal after motions; 0 where they reach it."""
+    return float(problem.goal.left(problem.covariance_after(sequence, start, cautious=True)[0][None])[0])
 
 
-def exchanged(problem: PlanningProblem, sequence: Sequence[int], start: int, *, known: np.ndarray | None = None,
-              fixed: int = 0) -> list[int]:
+def exchanged(problem: PlanningProblem, sequence: Sequence[int], start: int, *, fixed: int = 0) -> list[int]:
     """Return a shorter plan that does as much: motions are left out, latest first and none of the first `fixed`."""
-    def left(trial):
-        return float(problem.goal.left(problem.covariance_after(trial, start, known, cautious=True)[0][None])[0])
-
-    best, goal = list(sequence), left(sequence) + 1e-9
+    best, goal = list(sequence), remaining(problem, sequence, start) + 1e-9
     for place in range(len(best) - 1, fixed - 1, -1):
         trial = best[:place] + best[place + 1:]
-        if left(trial) <= goal:
+        if remaining(problem, trial, start) <= goal:
             best = trial
     return best
 
@@ -139,8 +132,6 @@ class NextMotion:
     """Reason of the choice or of the end."""
     seconds: float = 0.0
     """Length with the way to it, s."""
-    missing: tuple[str, ...] = ()
-    """Parameters that are not within their tolerance before it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,23 +198,20 @@ class Planner:
     Parameters
     ----------
     problem : PlanningProblem
-        Motions, model in tolerances, noise.
-    known : ndarray, optional
-        Information about the coordinates in addition to the prior.
+        Motions, model in tolerances, noise, earlier information.
 
     """
 
-    def __init__(self, problem: PlanningProblem, known: np.ndarray | None = None):
-        self.problem, self.known = problem, known
-        self._posterior = problem.posterior(known)
+    def __init__(self, problem: PlanningProblem):
+        self.problem, self._posterior = problem, problem.posterior()
         self._visited: set[int] = set()
-        self._first: list[int] | None = None if known is None else []
+        self._first: list[int] | None = None if problem.known is None else []
 
     def take(self, calibration: Calibration) -> None:
         """Replace the prediction by the covariance of a calibration, for the parameters that the model shares with it."""
         names = {name: k for k, name in enumerate(calibration.param_names)}
-        self.known = self.problem.coordinates.information_from(names, calibration.covariance)
-        self._posterior = self.problem.posterior(self.known)
+        self.problem.known = self.problem.coordinates.information_from(names, calibration.covariance)
+        self._posterior = self.problem.posterior()
 
     @property
     def excess(self) -> dict[str, float]:
@@ -237,17 +225,17 @@ class Planner:
         missing = self.problem.goal.missing(self._posterior.known)
         place = self.problem.place_near(position)
         if self._first is None:
-            self._first = [] if self.known is not None else self.problem.first_rests(place)
+            self._first = [] if self.problem.known is not None else self.problem.first_rests(place)
         if not self._first and not self.problem.goal.left(self._posterior.known[None])[0] > 0:
-            return NextMotion(None, STUCK if missing else GOAL_REACHED, missing=missing)
+            return NextMotion(None, STUCK if missing else GOAL_REACHED)
         choice, must = CandidateMotions(self.problem, self._posterior, place), bool(self._first)
         number = self._first.pop(0) if must else choice.best
         if not must and self._visited and choice.hopeless(number):
-            return NextMotion(None, STUCK, missing=missing)
+            return NextMotion(None, STUCK)
         self._posterior.take(choice.information[number], float(choice.seconds[number]))
         motion = self._named(number)
         reason = 'a session begins with rests in many attitudes' if must else f'it gains most per second for {", ".join(missing[:3])}'
-        return NextMotion(motion, reason, motion.seconds_from(position), missing)
+        return NextMotion(motion, reason, motion.seconds_from(position))
 
     def probe(self, position: np.ndarray, reach: np.ndarray) -> PlannedMotion | None:
         """Return a motion of every joint by at most `reach` (rad or m, shape (n_joints,)) to the wider side and back; None for zero."""
@@ -278,38 +266,38 @@ class Planner:
         problem = self.problem
         start = problem.library.spread[0] if position is None else np.asarray(position, float)
         place = problem.place_near(start)
-        first = () if self.known is not None else problem.first_rests(place)
+        first = () if problem.known is not None else problem.first_rests(place)
         self.within(longest)
         sequence = self._sequence(place, first, longest)
         bound, goal = float('nan'), problem.goal
         if with_bound and isinstance(goal, WithinTolerances):
             windows, _, seconds = problem.timed(sequence, place)
-            factor = problem.variance_factor(windows, self.known)
-            relaxed = problem.relaxation(self.known, factor=factor)
-            bound = problem.lower_bound(self.known, factor=factor, relaxed=relaxed)
+            factor = problem.variance_factor(windows)
+            relaxed = problem.relaxation(factor=factor)
+            bound = problem.lower_bound(factor=factor, relaxed=relaxed)
             if seconds > MAX_BOUND_RATIO * bound:   # what limits the relaxed plan counts more: a second attempt
                 weights = np.maximum(relaxed.weights / relaxed.weights.max(), MIN_RELATIVE_WEIGHT)
                 problem.goal = WithinTolerances(problem.coordinates, weights)
                 other = self._sequence(place, first, longest)
                 problem.goal = goal
                 windows, _, less = problem.timed(other, place)
-                if less < seconds and meets(problem, other, place, known=self.known):
-                    sequence, bound = other, problem.lower_bound(self.known, factor=problem.variance_factor(windows, self.known))
+                if less < seconds and remaining(problem, other, place) == 0.0:
+                    sequence, bound = other, problem.lower_bound(factor=problem.variance_factor(windows))
         return self._plan_of(sequence, start, place, bound)
 
     def _sequence(self, place, first, longest):
-        sequence = greedy(self.problem, place, known=self.known, first=first, longest=longest)
-        return exchanged(self.problem, sequence, place, known=self.known, fixed=len(first))
+        sequence = greedy(self.problem, place, first=first, longest=longest)
+        return exchanged(self.problem, sequence, place, fixed=len(first))
 
     def within(self, seconds: float) -> None:
         """Drop causes that no plan of this time separates."""
         if isinstance(self.problem.goal, ToldApart) and np.isfinite(seconds):
-            self.problem.goal.leave_out_of_reach(self.problem.best_covariance(seconds, self.known))
+            self.problem.goal.leave_out_of_reach(self.problem.best_covariance(seconds))
 
     def _plan_of(self, sequence, start, place, bound):
         problem, coordinates = self.problem, self.problem.coordinates
-        covariance, cautious = (problem.covariance_after(sequence, place, self.known, cautious=each)[0] for each in (False, True))
-        steps = [problem.covariance_after(sequence[:count], place, self.known) for count in range(len(sequence) + 1)]
+        covariance, cautious = (problem.covariance_after(sequence, place, cautious=each)[0] for each in (False, True))
+        steps = [problem.covariance_after(sequence[:count], place) for count in range(len(sequence) + 1)]
         self._visited.clear()
         return Plan(coordinates.model, tuple(self._named(number) for number in sequence), np.array([seconds for _, seconds in steps[1:]]),
                     coordinates.sd(covariance), coordinates.tolerances, coordinates.wanted,

@@ -54,11 +54,14 @@ class PlanningProblem:
         Sensor -> NoiseModel of single samples.
     rate : float
         Samples per second.
+    known : ndarray, optional
+        Information about z of an earlier calibration, in addition to the prior.
 
     """
 
-    def __init__(self, library: MotionLibrary, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float = 100.0):
-        self.library, self.coordinates, self.noise, self.rate = library, coordinates, noise, rate
+    def __init__(self, library: MotionLibrary, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float = 100.0,
+                 known: np.ndarray | None = None):
+        self.library, self.coordinates, self.noise, self.rate, self.known = library, coordinates, noise, rate, known
         self.goal: Goal = WithinTolerances(coordinates)
         self.predictor = WindowPredictor(library.table, coordinates, noise, rate=rate)
 
@@ -111,10 +114,14 @@ class PlanningProblem:
         found = np.array([posterior.information_of(self.way_windows[place, b]) for b in range(len(self.library.places))])
         return found[targets]
 
-    def posterior(self, known: np.ndarray | None = None) -> Posterior:
-        """Return the belief before any motion, with information about z in addition to the prior."""
-        prior = self.coordinates.prior_information
-        return Posterior(prior if known is None else prior + known, self.noise)
+    @property
+    def prior(self) -> np.ndarray:
+        """Information about z before any motion, shape (n, n)."""
+        return self.coordinates.prior_information + (0.0 if self.known is None else self.known)
+
+    def posterior(self) -> Posterior:
+        """Return the belief before any motion."""
+        return Posterior(self.prior, self.noise)
 
     def place_near(self, position: np.ndarray) -> int:
         """Return the number of the place nearest to a position, without whole turns of endless joints."""
@@ -136,7 +143,7 @@ class PlanningProblem:
             chosen.append(min(here, key=self.seconds.__getitem__))
         return chosen
 
-    def variance_factor(self, windows: Sequence[PlannedWindow], known: np.ndarray | None = None) -> float:
+    def variance_factor(self, windows: Sequence[PlannedWindow]) -> float:
         """
         Return the factor on the noise variance that its estimate exceeds on none of six axes, with probability PROBABILITY.
 
@@ -146,7 +153,7 @@ class PlanningProblem:
         if not isinstance(self.goal, WithinTolerances):
             return 1.0
         counts = np.array([window.samples for window in windows if window.kind == 'static'])
-        rests = (counts.sum()**2 / (counts**2).sum() if len(counts) else 1.0) + (0 if known is None else LEAST_RESTS)
+        rests = (counts.sum()**2 / (counts**2).sum() if len(counts) else 1.0) + (0 if self.known is None else LEAST_RESTS)
         return float(chi2_isf((1 - PROBABILITY) / 6, BATCH_DOF * rests) / (BATCH_DOF * rests))
 
     def least_session(self) -> float:
@@ -155,7 +162,7 @@ class PlanningProblem:
         away = self.way_seconds[~np.eye(len(self.way_seconds), dtype=bool)]
         return float(self.seconds[rests].sum() + max(len(rests) - 1, 0) * away.min(initial=np.inf)) if len(rests) > 1 else 0.0
 
-    def lower_bound(self, known: np.ndarray | None = None, *, factor: float = 1.0, relaxed: Relaxation | None = None) -> float:
+    def lower_bound(self, *, factor: float = 1.0, relaxed: Relaxation | None = None) -> float:
         """
         Return a time below which no plan made of these motions and the moves between their places meets the tolerances, s.
 
@@ -166,8 +173,8 @@ class PlanningProblem:
         parameters for any amount of data: every plan needs at least ``min(T, value(T))``, the value that of the
         relaxation for sessions of T. The largest bound over T is used; without any T the share is zero.
         """
-        best = (relaxed or self.relaxation(known, factor=factor)).seconds
-        if known is not None or not np.isfinite(best):
+        best = (relaxed or self.relaxation(factor=factor)).seconds
+        if self.known is not None or not np.isfinite(best):
             return best
         floor = self._bias_floor(factor)
         if not np.isfinite(floor):
@@ -175,7 +182,7 @@ class PlanningProblem:
         for share in COMMON_SHARES if floor > 0.3 * best else ():
             seconds = max(best, floor)
             for _ in range(ROUNDS_OF_LENGTH):
-                value = self.relaxation(known, common=(share, seconds), factor=factor).seconds
+                value = self.relaxation(common=(share, seconds), factor=factor).seconds
                 best = max(best, min(seconds, value))
                 if value < 1.05 * seconds:
                     break
@@ -196,9 +203,9 @@ class PlanningProblem:
                 floor = max(floor, float(lengths[max(int(np.argmax(enough)) - 1, 0)]) if enough.any() else np.inf)
         return floor
 
-    def relaxation(self, known: np.ndarray | None = None, *, common: tuple[float, float] | None = None, factor: float = 1.0) -> Relaxation:
+    def relaxation(self, *, common: tuple[float, float] = (0.0, 0.0), factor: float = 1.0) -> Relaxation:
         """Return the relaxed plan; `common`: (share of the biases' covariance, seconds of the longest session that counts)."""
-        share, seconds = common or (0.0, 0.0)
+        share, seconds = common
         edges = [key for key, windows in self.way_windows.items() if windows]
         own = np.flatnonzero(self.seconds > 0)
         everything = [*(self.windows[number] for number in own), *(self.way_windows[key] for key in edges)]
@@ -206,8 +213,7 @@ class PlanningProblem:
         most = np.array([sum((additive_bound(window, self.noise, share=1.0 - share, factor=factor) for window in windows), empty)
                          for windows in everything])
         cost = np.concatenate([self.seconds[own], [self.way_seconds[key] for key in edges]])
-        prior = self.coordinates.prior_information + (0.0 if known is None else known)
-        asked = self.coordinates.asked
+        prior, asked = self.prior, self.coordinates.asked
         if share:
             prior, asked = self._with_common(prior, asked, share, seconds)
         return relax(most, cost, prior, asked=asked)
@@ -244,16 +250,15 @@ class PlanningProblem:
             place = target
         return windows, np.array(times), float(now)
 
-    def covariance_after(self, sequence: Sequence[int], start: int, known: np.ndarray | None = None, *,
-                         cautious: bool = False) -> tuple[np.ndarray, float]:
+    def covariance_after(self, sequence: Sequence[int], start: int, *, cautious: bool = False) -> tuple[np.ndarray, float]:
         """Return (covariance of z, total time) after motions one after the other from a place; `cautious`: with `variance_factor`."""
         windows, times, seconds = self.timed(sequence, start)
-        total = self.coordinates.prior_information + (0.0 if known is None else known)
+        total = self.prior
         if windows:
-            total = total + exact_information(windows, times, self.noise, factor=self.variance_factor(windows, known) if cautious else 1.0)
+            total = total + exact_information(windows, times, self.noise, factor=self.variance_factor(windows) if cautious else 1.0)
         return np.linalg.inv(total), seconds
 
-    def best_covariance(self, seconds: float, known: np.ndarray | None = None) -> np.ndarray:
+    def best_covariance(self, seconds: float) -> np.ndarray:
         """
         Return a lower bound of the covariance of z of all plans of these motions and their moves in this time.
 
@@ -261,7 +266,7 @@ class PlanningProblem:
         """
         moves = [(windows, float(self.way_seconds[key])) for key, windows in self.way_windows.items() if windows]
         everything = [*zip(self.windows, self.seconds.tolist(), strict=True), *moves]
-        total = self.coordinates.prior_information + (0.0 if known is None else known)
+        total = self.prior
         for windows, length in everything:
             if windows:
                 total = total + sum(additive_bound(window, self.noise) for window in windows) * max(seconds / length, 1.0)
@@ -289,17 +294,14 @@ def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
 def expected_noise(figures: NoiseFigures | None, grade: str, rate: float) -> dict[str, NoiseModel]:
     """Return sensor -> NoiseModel of samples at `rate` (Hz): the identified model, or that of a grade."""
     require_grade(grade)
-    return noise_of_grade(GRADES[grade].noise, rate) if figures is None else noise_of_figures(figures, rate)
+    if figures is None:
+        return noise_of_grade(GRADES[grade].noise, rate)
+    slow = bias_processes(figures)   # the slow part as Gauss-Markov processes
+    return {sensor: NoiseModel(np.array([axis.white**2 * rate for axis in figures.sensor(sensor)]), np.ones(3), bias_processes=slow[sensor])
+            for sensor in SENSORS}
 
 
 def require_grade(grade: str) -> None:
     """Refuse a grade that is none with an InputError."""
     if grade not in GRADES:
         raise InputError(f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise")
-
-
-def noise_of_figures(figures: NoiseFigures, rate: float) -> dict[str, NoiseModel]:
-    """Return sensor -> NoiseModel of samples at `rate` (Hz) from identified noise, its slow part as Gauss-Markov processes."""
-    slow = bias_processes(figures)
-    return {sensor: NoiseModel(np.array([axis.white**2 * rate for axis in figures.sensor(sensor)]), np.ones(3), bias_processes=slow[sensor])
-            for sensor in SENSORS}

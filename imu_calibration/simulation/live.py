@@ -10,10 +10,9 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import clip, warped_reference
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import lever_matrix
-from imu_calibration.kinematics.signal_history import autoregressive
 from imu_calibration.kinematics.table import Table
-from imu_calibration.simulation.sensor_noise import Cause, Felt, quantise, read_encoders
-from imu_calibration.simulation.session import SimulationOptions, answered, temperature_at
+from imu_calibration.simulation.sensor_noise import Cause, Felt, ImuNoise, jitter_stamps
+from imu_calibration.simulation.session import SimulationOptions, answered, joint_samples, temperature_at
 from imu_calibration.simulation.table_controller import TableController
 
 TEMPERATURE_RATE = 1.0
@@ -62,9 +61,7 @@ class LiveSimulation:
         self.start_ns, self.causes = start_ns, tuple(causes)
         self._rng = np.random.default_rng([seed, 3])
         self._n = {'imu': 0, 'joints': 0, 'temperature': 0}
-        noise = options.noise
-        self._wander = [_Wander(sd, noise.correlation_time, 1 / options.imu_rate, self._rng)
-                        for sd in (noise.accel_instability, noise.gyro_instability)]
+        self._noise = ImuNoise(options.noise, sample_rate=options.imu_rate, rng=self._rng)
 
     def take(self, until: float) -> SimulatedBlock:
         """Return the samples from the end of the last block to `until` (s, exclusive)."""
@@ -86,15 +83,11 @@ class LiveSimulation:
         if not len(time):
             empty = ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), self.options.frame_id)
             return empty, empty
-        motion, noise = self.motion.at(time), self.options.noise
-        outputs = []
-        figures = ((noise.accel_density, noise.accel_resolution), (noise.gyro_density, noise.gyro_resolution))
-        for sensor, output, wander, (density, resolution) in zip(SENSORS, self._answered(time, motion), self._wander, figures):
-            white = self._rng.normal(0.0, density * np.sqrt(self.options.imu_rate), output.shape)
-            outputs.append(clip(self.model, sensor, self.values, output=quantise(output + white + wander.take(len(output)), resolution)))
-        jitter = np.round(self._rng.normal(0.0, noise.stamp_jitter * 1e9, len(time))).astype(np.int64) if noise.stamp_jitter else 0
-        stamps = self._stamps(time) + jitter
-        return ImuSamples(stamps, *outputs, self.options.frame_id), self._truth(stamps, motion)
+        motion = self.motion.at(time)
+        noisy = self._noise.add(*self._answered(time, motion))
+        force, rate = (clip(self.model, sensor, self.values, output=output) for sensor, output in zip(SENSORS, noisy))
+        stamps = jitter_stamps(self._stamps(time), self.options.noise.stamp_jitter, self._rng)
+        return ImuSamples(stamps, force, rate, self.options.frame_id), self._truth(stamps, motion)
 
     def _answered(self, time, motion):
         """Return the outputs of the sensors without noise."""
@@ -116,32 +109,11 @@ class LiveSimulation:
         return ImuSamples(stamps, force, felt[1].rate_s, self.options.frame_id)
 
     def _joints(self, until):
-        time = self._times('joints', self.options.joint_rate, 0.5, until)
-        names = tuple(self.table.joint_names)
-        if not len(time):
-            return JointSamples(np.zeros(0, np.int64), np.zeros((0, len(names))), np.zeros((0, len(names))), names)
-        motion = self.motion.at(time)
-        velocity = motion.rate if self.options.with_velocity else np.full_like(motion.rate, np.nan)
-        return JointSamples(self._stamps(time), read_encoders(motion.position, self.options.noise, self._rng), velocity, names)
+        motion = self.motion.at(self._times('joints', self.options.joint_rate, 0.5, until))
+        return joint_samples(motion, self.table, self.options, start_ns=self.start_ns, rng=self._rng)
 
     def _temperature(self, until):
         if self.options.temperature_start_c is None:
             return None
         time = self._times('temperature', TEMPERATURE_RATE, 0.0, until)
-        return TemperatureSamples(self._stamps(time), temperature_at(time, self.options) if len(time) else np.zeros(0))
-
-
-class _Wander:
-    """The first-order Gauss-Markov bias of `gauss_markov`, continued from block to block."""
-
-    def __init__(self, sd, correlation_time, step, rng):
-        self._decay, self._rng = np.exp(-step / correlation_time), rng
-        self._drive_sd = sd * np.sqrt(-np.expm1(-2.0 * step / correlation_time))
-        self._state = rng.normal(0.0, sd, 3)
-
-    def take(self, count):
-        """Return the next values, shape (count, 3)."""
-        drive = self._rng.normal(0.0, self._drive_sd, (count, 3))
-        values = autoregressive(drive, self._decay, self._state)
-        self._state = values[-1]
-        return values
+        return TemperatureSamples(self._stamps(time), temperature_at(time, self.options))

@@ -92,17 +92,17 @@ def realistic(grade: str = 'industrial', encoder_resolution: float = 0.001 * DEG
 
 
 def gauss_markov(standard_deviation: float | np.ndarray, correlation_time: float, step: float, *, shape: tuple[int, ...],
-                 rng: np.random.Generator) -> np.ndarray:
+                 rng: np.random.Generator, before: np.ndarray | None = None) -> np.ndarray:
     """
     Return a stationary first-order Gauss-Markov process along the first axis of `shape`.
 
-    ``x[k] = a x[k-1] + sd sqrt(1 - a^2) w[k]`` with ``a = exp(-step / correlation_time)``, started from its stationary
-    distribution.
+    ``x[k] = a x[k-1] + sd sqrt(1 - a^2) w[k]`` with ``a = exp(-step / correlation_time)``, continued from the values `before`, or started
+    from its stationary distribution.
     """
     decay = np.exp(-step / correlation_time)
     drive = rng.normal(0.0, standard_deviation, shape)
-    drive[1:] *= np.sqrt(-np.expm1(-2.0 * step / correlation_time))
-    return autoregressive(drive.reshape(len(drive), -1), decay, 0.0).reshape(shape)
+    drive[1 if before is None else 0:] *= np.sqrt(-np.expm1(-2.0 * step / correlation_time))
+    return autoregressive(drive.reshape(len(drive), -1), decay, 0.0 if before is None else before).reshape(shape)
 
 
 def quantise(values: np.ndarray, step: float) -> np.ndarray:
@@ -117,15 +117,12 @@ def jitter_stamps(stamp_ns: np.ndarray, standard_deviation: float, rng: np.rando
     return stamp_ns + np.round(rng.normal(0.0, standard_deviation * 1e9, len(stamp_ns))).astype(np.int64)
 
 
-def add_imu_noise(force_s: np.ndarray, rate_s: np.ndarray, model: SimulatedNoise, *, sample_rate: float,
-                  rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+class ImuNoise:
     """
-    Return the readings with white noise, bias wander and resolution.
+    White noise, bias wander and resolution of an IMU; the wander continues from call to call.
 
     Parameters
     ----------
-    force_s, rate_s : array, shape (n, 3)
-        Outputs without noise, m/s^2 and rad/s.
     model : SimulatedNoise
     sample_rate : float
         Hz; a density d gives every sample the standard deviation ``d sqrt(sample_rate)``, so that the integral over t seconds
@@ -133,13 +130,23 @@ def add_imu_noise(force_s: np.ndarray, rate_s: np.ndarray, model: SimulatedNoise
     rng : numpy.random.Generator
 
     """
-    noisy = []
-    for true, density, instability, resolution in ((force_s, model.accel_density, model.accel_instability, model.accel_resolution),
-                                                   (rate_s, model.gyro_density, model.gyro_instability, model.gyro_resolution)):
-        values = true + rng.normal(0.0, density * np.sqrt(sample_rate), true.shape)
-        values += gauss_markov(instability, model.correlation_time, 1.0 / sample_rate, shape=true.shape, rng=rng)
-        noisy.append(quantise(values, resolution))
-    return tuple(noisy)
+
+    def __init__(self, model: SimulatedNoise, *, sample_rate: float, rng: np.random.Generator):
+        self._model, self._rate, self._rng = model, sample_rate, rng
+        self._force_bias = self._rate_bias = None
+
+    def add(self, force_s: np.ndarray, rate_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return readings from outputs without noise, m/s^2 and rad/s, shape (n, 3), n at least 1."""
+        model = self._model
+        force, self._force_bias = self._added(force_s, model.accel_density, model.accel_instability, self._force_bias)
+        rate, self._rate_bias = self._added(rate_s, model.gyro_density, model.gyro_instability, self._rate_bias)
+        return quantise(force, model.accel_resolution), quantise(rate, model.gyro_resolution)
+
+    def _added(self, true, density, instability, before):
+        """Return (values with noise, last value of the bias)."""
+        values = true + self._rng.normal(0.0, density * np.sqrt(self._rate), true.shape)
+        bias = gauss_markov(instability, self._model.correlation_time, 1.0 / self._rate, shape=true.shape, rng=self._rng, before=before)
+        return values + bias, bias[-1]
 
 
 def read_encoders(position: np.ndarray, model: SimulatedNoise, rng: np.random.Generator) -> np.ndarray:

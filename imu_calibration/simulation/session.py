@@ -17,7 +17,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, WindowKind, all_samples, chunks
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import Profile
-from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_imu_noise, gauss_markov, jitter_stamps, read_encoders
+from imu_calibration.simulation.sensor_noise import GRADES, ImuNoise, SimulatedNoise, gauss_markov, jitter_stamps, read_encoders
 
 LOUDEST = 0.25
 """Its rms in the band of each axis in its loudest gear, m/s^2."""
@@ -137,17 +137,20 @@ def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: P
     rng = np.random.default_rng([seed, 3])
     n_imu, n_joint = (int(profile.duration * rate) for rate in (options.imu_rate, options.joint_rate))
     time = np.arange(n_imu) / options.imu_rate
-    outputs = _outputs(model, values, table, profile, time, options)
-    force, rate = add_imu_noise(outputs[0], outputs[1], options.noise, sample_rate=options.imu_rate, rng=rng)
-    force, rate = (clip(model, sensor, values, output=output) for sensor, output in zip(SENSORS, (force, rate)))
+    noisy = ImuNoise(options.noise, sample_rate=options.imu_rate, rng=rng).add(*_outputs(model, values, table, profile, time, options))
+    force, rate = (clip(model, sensor, values, output=output) for sensor, output in zip(SENSORS, noisy))
     stamps = jitter_stamps(SESSION_START_NS + np.round(time * 1e9).astype(np.int64), options.noise.stamp_jitter, rng)
     imu = ImuSamples(stamps, force, rate, options.frame_id)
-    joint_time = (np.arange(n_joint) + 0.5) / options.joint_rate
-    motion = profile.at(joint_time)
-    position = read_encoders(motion.position, options.noise, rng)
-    velocity = motion.rate if options.with_velocity else np.full_like(motion.rate, np.nan)
-    joints = JointSamples(SESSION_START_NS + np.round(joint_time * 1e9).astype(np.int64), position, velocity, tuple(table.joint_names))
+    joints = joint_samples(profile.at((np.arange(n_joint) + 0.5) / options.joint_rate), table, options, start_ns=SESSION_START_NS, rng=rng)
     return imu, joints, _temperature_topic(profile, options)
+
+
+def joint_samples(motion: JointMotion, table: Table, options: SimulationOptions, *, start_ns: int,
+                  rng: np.random.Generator) -> JointSamples:
+    """Return a motion as its encoders measure it; `start_ns` is the stamp of time zero."""
+    stamp_ns, position = start_ns + np.round(motion.time * 1e9).astype(np.int64), read_encoders(motion.position, options.noise, rng)
+    velocity = motion.rate if options.with_velocity else np.full_like(motion.rate, np.nan)
+    return JointSamples(stamp_ns, position, velocity, tuple(table.joint_names))
 
 
 def _outputs(model, values, table, profile, time, options):

@@ -7,7 +7,8 @@ from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomic
 from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 
 from imu_calibration.core.settings import describe  # noqa: E402
-from imu_calibration.nodes.parameters import NODES, settings_of  # noqa: E402
+from imu_calibration.nodes import NODE_NAMES  # noqa: E402
+from imu_calibration.nodes.parameters import settings_of  # noqa: E402
 from imu_calibration.planning.campaign import CampaignSettings  # noqa: E402
 from imu_calibration.planning.driver import DriverSettings  # noqa: E402
 
@@ -53,7 +54,7 @@ def asked(station, kind, node, **fields):
     return station.call(f'/{node}/{SERVICES[kind]}', kind, again=5.0, **fields)
 
 
-@pytest.mark.parametrize('node', NODES)
+@pytest.mark.parametrize('node', NODE_NAMES)
 def test_a_live_parameter_changes_and_any_other_is_rejected_with_the_reason(node, tmp_path):
     items = [item for group in settings_of(node) for item in describe(group)]
     with Station(tmp_path / 'out.txt') as station:

@@ -9,19 +9,21 @@ import pytest
 import yaml
 
 from imu_calibration.core.settings import describe, setting
-from imu_calibration.nodes.parameters import NODES, main, rendered, settings_of, value_text
+from imu_calibration.nodes import NODE_NAMES
+from imu_calibration.nodes.parameters import settings_of, value_text
+from tools.parameter_files import main, rendered
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.mark.parametrize('node', NODES)
+@pytest.mark.parametrize('node', NODE_NAMES)
 def test_parameter_file_is_the_declaration(node):
     written, declared = (ROOT / 'config' / f'{node}.yaml').read_text(), rendered(node)
     difference = '\n'.join(difflib.unified_diff(written.splitlines(), declared.splitlines(), 'written', 'declared', lineterm=''))
     assert not difference, f'run make config\n{difference}'
 
 
-@pytest.mark.parametrize('node', NODES)
+@pytest.mark.parametrize('node', NODE_NAMES)
 def test_yaml_gives_the_defaults_back(node):
     values = yaml.safe_load(rendered(node))['/**']['ros__parameters'] or {}
     defaults = {item.name: item.default for group in settings_of(node) for item in describe(group) if not item.session}
@@ -36,11 +38,11 @@ def test_values_keep_their_type(value):
 
 
 def test_make_config_writes_what_is_missing_and_leaves_the_rest(tmp_path, capsys):
-    for node in NODES[1:]:
+    for node in NODE_NAMES[1:]:
         (tmp_path / f'{node}.yaml').write_text(rendered(node))
     main(tmp_path)
-    assert f'{tmp_path}/{NODES[0]}.yaml' in capsys.readouterr().out
-    assert (tmp_path / f'{NODES[0]}.yaml').read_text() == rendered(NODES[0])
+    assert f'{tmp_path}/{NODE_NAMES[0]}.yaml' in capsys.readouterr().out
+    assert (tmp_path / f'{NODE_NAMES[0]}.yaml').read_text() == rendered(NODE_NAMES[0])
 
 
 def test_a_new_setting_is_a_parameter_and_a_line_of_its_file(monkeypatch):

@@ -5,8 +5,8 @@ import pytest
 
 from imu_calibration.simulation.sensor_noise import (
     GRADES,
+    ImuNoise,
     SimulatedNoise,
-    add_imu_noise,
     gauss_markov,
     jitter_stamps,
     quantise,
@@ -17,7 +17,7 @@ from imu_calibration.simulation.sensor_noise import (
 
 def test_white_noise_integrates_to_a_random_walk_of_its_density():
     model = SimulatedNoise(accel_density=2e-3, gyro_density=1e-4)
-    force, rate = add_imu_noise(np.zeros((40000, 3)), np.zeros((40000, 3)), model, sample_rate=200.0, rng=np.random.default_rng(1))
+    force, rate = ImuNoise(model, sample_rate=200.0, rng=np.random.default_rng(1)).add(np.zeros((40000, 3)), np.zeros((40000, 3)))
     for noise, density in ((force, 2e-3), (rate, 1e-4)):
         # 1200 integrals over 0.5 s: 2 % sampling error of their sd.
         walk = noise.reshape(-1, 100, 3).sum(axis=1) / 200.0
@@ -34,9 +34,18 @@ def test_bias_wander_is_stationary_with_its_correlation_time():
         assert correlation == pytest.approx(np.exp(-lag * 0.1 / 5.0), abs=0.02)
 
 
+def test_bias_wander_continues_from_block_to_block():
+    rng = np.random.default_rng(5)
+    first = gauss_markov(3.0, 5.0, 0.1, shape=(10, 4000), rng=rng)
+    second = gauss_markov(3.0, 5.0, 0.1, shape=(10, 4000), rng=rng, before=first[-1])
+    # 4000 independent paths: 1.6 % sampling error.
+    assert np.mean(second[0] * first[-1]) / 9.0 == pytest.approx(np.exp(-0.1 / 5.0), abs=0.06)
+    assert np.std(second[0] - first[-1]) == pytest.approx(3.0 * np.sqrt(2 * -np.expm1(-0.1 / 5.0)), rel=0.06)
+
+
 def test_no_noise_changes_nothing():
     force = np.random.default_rng(3).normal(size=(10, 3))
-    for got in add_imu_noise(force, force, SimulatedNoise(), sample_rate=100.0, rng=np.random.default_rng(4)):
+    for got in ImuNoise(SimulatedNoise(), sample_rate=100.0, rng=np.random.default_rng(4)).add(force, force):
         np.testing.assert_array_equal(got, force)
     np.testing.assert_array_equal(read_encoders(force, SimulatedNoise(), np.random.default_rng(4)), force)
 

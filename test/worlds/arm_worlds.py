@@ -22,7 +22,7 @@ from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import table_from_urdf
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.sensor_noise import GRADES, add_imu_noise, read_encoders, realistic
+from imu_calibration.simulation.sensor_noise import GRADES, ImuNoise, read_encoders, realistic
 
 from worlds.arms import SIX_AXES
 from worlds.physics_draw import draw_imu, generator, to_ns
@@ -69,7 +69,8 @@ def make_arm_world(seed, joint_error=3e-4, place_error=0.0, text=SIX_AXES, link=
     forces = [_force(poses, arm) for arm in accelerometer.arms]
     still = np.full(len(time), 25.0)
     outputs = (accelerometer.respond(forces, time, still, forces[0]), gyroscope.respond([_rate(poses)] * 3, time, still, forces[0]))
-    imu = ImuSamples(START_NS + to_ns(time), *add_imu_noise(*outputs, noise, sample_rate=rate, rng=generator(seed, 'noise')), link)
+    noisy = ImuNoise(noise, sample_rate=rate, rng=generator(seed, 'noise')).add(*outputs)
+    imu = ImuSamples(START_NS + to_ns(time), *noisy, link)
     # As joint states come: in another order, with joints that are nobody's business.
     joint_time = time[:-1] + 0.5 / rate
     motion = profile.at(joint_time)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, add_imu_noise, jitter_stamps, read_encoders, realistic
+from imu_calibration.simulation.sensor_noise import GRADES, ImuNoise, SimulatedNoise, jitter_stamps, read_encoders, realistic
 
 from worlds.physics_cause import NO_CAUSE
 from worlds.physics_draw import Climate, draw_events, draw_imu, draw_value, generator, to_ns
@@ -139,7 +139,7 @@ def make_session(seed, hidden=None, noise='white', *, grade='industrial', imu_ra
     _set_limits(triads, outputs, values)
     if noise in WANDERS:
         outputs = add_wander(outputs, noise, GRADES[grade].noise, 1.0 / imu_rate, generator(seed, 'wander'))
-    outputs = add_imu_noise(*outputs, model, sample_rate=imu_rate, rng=generator(seed, 'noise'))
+    outputs = ImuNoise(model, sample_rate=imu_rate, rng=generator(seed, 'noise')).add(*outputs)
     outputs = [np.clip(out, -triad.limit, triad.limit) for out, triad in zip(outputs, triads)]
 
     clock = generator(seed, 'clock')

@@ -47,9 +47,7 @@ class TrialMotion:
     """True motion on which a loss is measured."""
 
     reference: Reference
-    """Specific force, rate and angular acceleration at our origin in our sensor frame."""
-    temperature_c: np.ndarray
-    """Temperature, degrees Celsius, shape (n,)."""
+    """Specific force, rate and angular acceleration at our origin in our sensor frame, and the temperature."""
     text: str
     """Description."""
 
@@ -58,7 +56,7 @@ def motion_of(force: np.ndarray, rate: np.ndarray, alpha: np.ndarray, *, tempera
     """Return a motion from its arrays, shapes (n, 3) and (n,)."""
     attitude = np.broadcast_to(np.eye(3), (len(force), 3, 3))
     reference = Reference(np.zeros(len(force)), attitude, force, rate, alpha, STANDARD_GRAVITY, temperature_c)
-    return TrialMotion(reference, temperature_c, text)
+    return TrialMotion(reference, text)
 
 
 def standard_motion(calibration: Calibration) -> TrialMotion:
@@ -183,8 +181,9 @@ def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, place
     if target.whole:
         made = true   # it represents all effects of the full compensation
     else:
+        assert ref.temperature_c is not None   # a trial motion has it
         force, rate = placement.readings(*seen.values())
-        readings = Readings(force, rate, ref.alpha_s @ placement.mat_ts.T, motion.temperature_c)
+        readings = Readings(force, rate, ref.alpha_s @ placement.mat_ts.T, ref.temperature_c)
         made = target.corrected(numbers, readings)
     lost = () if target.whole else tuple(_lost(calibration, effect, target.holds, motion) for effect in effects.values()
                                          if effect not in estimated and not _whole(calibration, effect, target.holds))
