@@ -149,7 +149,7 @@ def advice_of(state: WorkerState) -> str:
     return next(iter([*steps, *(group.needs for group in state.groups if group.needs)]), '')
 
 
-LEVELS = {word: level for level, words in (
+STATUS_LEVELS = {word: level for level, words in (
     (OK, ('good', 'determined', 'waiting', 'nothing found', 'off', '', 'helps')),
     (WARN, ('trouble', 'weak', 'held', 'found', 'unexplained', 'unproven')), (ERROR, ('silent', 'failed', 'harms'))) for word in words}
 """Word of a stream, a parameter group, a session, a diagnosis or a decision -> its level."""
@@ -159,16 +159,16 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
     """Return the DiagnosticStatus messages of a WorkerState; `stream_faults` are lines about its topics."""
     found = []
     if state.streams is not None:
-        level = max(LEVELS[state.streams.word], WARN if stream_faults else OK)
+        level = max(STATUS_LEVELS[state.streams.word], WARN if stream_faults else OK)
         found.append(make_status(level, 'streams', '; '.join([state.streams.message, *stream_faults]), values=state.streams.values))
     parts = [state.judged or state.verdict or 'waiting for motion', *state.lines[:3], *[state.trouble] * bool(state.trouble), *state.faults]
     incomplete = WARN if state.verdict and (state.trouble or not state.complete) else OK
-    level = ERROR if state.faults else max(LEVELS[state.verdict], incomplete)
+    level = ERROR if state.faults else max(STATUS_LEVELS[state.verdict], incomplete)
     found.append(make_status(level, 'calibration', '; '.join(dict.fromkeys(parts)), values={'version': state.solution, **state.values}))
     if state.session is not None:
-        found.append(make_status(LEVELS[state.session.word], 'poses', state.session.message, values=state.session.values))
+        found.append(make_status(STATUS_LEVELS[state.session.word], 'poses', state.session.message, values=state.session.values))
     if state.diagnosis is not None:
-        found.append(make_status(LEVELS[state.diagnosis.word], 'diagnosis', state.diagnosis.message,
+        found.append(make_status(STATUS_LEVELS[state.diagnosis.word], 'diagnosis', state.diagnosis.message,
                                  values={'outcome': state.diagnosis.word, **state.diagnosis.values}))
     return found + [_group_status(group) for group in state.groups]
 
@@ -182,7 +182,7 @@ def _group_status(group: GroupState):
                f'predicted after that motion [{group.unit}]': group.predicted_sd}
     values = {'parameter': group.parameter, 'needs': group.needs,
               **{name: f'{figure:.3g}' for name, figure in figures.items() if not math.isnan(figure)}}
-    return make_status(LEVELS[group.status], f'{group.sensor} {group.effect}', text, values=values)
+    return make_status(STATUS_LEVELS[group.status], f'{group.sensor} {group.effect}', text, values=values)
 
 
 def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:

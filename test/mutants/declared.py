@@ -317,7 +317,7 @@ LIVE = _of(
      'np.full(len(self), np.inf)', 'test_joint_ranges.py'),
     ('joint states wait in line', 'BatchInput._arrived', 'self.drain()', 'False',
      'test_planner_node.py::test_joint_states_that_came_while_it_was_busy_are_all_taken_at_once'),
-    ('a node without work is not woken to end', 'run_node', '_look_again(_1)', 'pass', 'test_node_ends.py'),
+    ('a node without work is not woken to end', 'run_node', 'every(_1, LOOK_AGAIN, lambda: None)', 'pass', 'test_node_ends.py'),
     ('its own work taken for silence of the sensor', 'CalibrationWorker._tell', 'self._watch.state(self._looked)',
      'self._watch.state(time.monotonic())', 'test_calibration_worker.py'),
     ('its own work taken for the end of the motion', 'CalibrationWorker._solve_when_due', 'self._looked', 'time.monotonic()',
