@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import cache
-from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,12 +41,18 @@ def is_standard(message_type: str, encoding: str, text: str) -> bool:
     """Return whether a definition has the fields of the standard one; without a text the standard is assumed."""
     if not text:
         return True
-    if encoding != 'ros2msg':
+    if encoding != 'ros2msg' or len(text) > MAX_DEFINITION_CHARACTERS:
         return False
     try:
-        return _flatten(text) == _flatten(standard_definition(message_type).text)
-    except (KeyError, IndexError, RecursionError, ValueError):
+        return _fields(text, message_type) == _fields(standard_definition(message_type).text, message_type)
+    except Exception:   # rosbags' parser raises many kinds
         return False
+
+
+def _fields(text, message_type):
+    """Return the types of a ros2msg definition with their fields, without constants and default values."""
+    from rosbags.typesys import get_types_from_msg
+    return {name: fields for name, (_, fields) in get_types_from_msg(text, message_type).items()}
 
 
 def deserializer(message_type: str, definitions: dict[str, tuple[str, str]], ros1: bool = False) -> Callable:
@@ -125,31 +130,3 @@ def _require_size(types, message_type):
         return one * content[1] if kind.name == 'ARRAY' else one
 
     elements(message_type)
-
-
-def _flatten(text):
-    """List the plain fields of a ros2msg definition in order, fields of nested types by their path (raises ValueError for too many)."""
-    if len(text) > MAX_DEFINITION_CHARACTERS:
-        raise ValueError('too long')
-    n_lines = count()
-    first, *others = text.replace('\r', '').split(SEPARATOR + '\n')
-    nested = {}
-    for part in others:
-        name, _, body = part.partition('\n')
-        nested[name.removeprefix('MSG:').strip().rpartition('/')[2]] = body
-
-    def expand(body, prefix):
-        for line in body.split('\n'):
-            if next(n_lines) > MAX_ELEMENTS:
-                raise ValueError('too many fields')
-            words = line.split('#')[0].split()
-            if not words or '=' in line.split('#')[0]:   # empty, or a constant
-                continue
-            kind, name = words[0], prefix + words[1]
-            one, bracket, count = kind.partition('[')   # of a sequence
-            if '/' in kind or kind in nested:
-                yield from expand(nested[one.rpartition('/')[2]], name + bracket + count + '.')
-            else:
-                yield kind, name
-
-    return list(expand(first, ''))

@@ -1,8 +1,9 @@
 """Common part of the readers of storage files: from stretches of rows to messages by topic."""
 
-import queue
-import threading
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -103,10 +104,10 @@ class StorageFile:
 
 Piece = TypeVar('Piece')
 
-MAX_WAITING_PIECES = 2
-"""Pieces that wait at most; bounds the memory."""
+PIECES_AHEAD = 3
+"""Pieces that are read or wait at most; bounds the memory."""
 
-_END = object()
+_END: Any = object()
 
 
 def read_ahead(pieces: Generator[Piece, None, None]) -> Generator[Piece, None, None]:
@@ -115,38 +116,11 @@ def read_ahead(pieces: Generator[Piece, None, None]) -> Generator[Piece, None, N
 
     The thread ends with the generator, or soon after the consumer has closed this one.
     """
-    waiting: queue.Queue[Any] = queue.Queue(MAX_WAITING_PIECES)
-    stop = threading.Event()
-
-    def put(item):
-        while not stop.is_set():
-            try:
-                return waiting.put(item, timeout=0.2)
-            except queue.Full:
-                continue
-
-    def run():
+    with closing(pieces), ThreadPoolExecutor(1) as thread:
+        waiting = deque(thread.submit(next, pieces, _END) for _ in range(PIECES_AHEAD))
         try:
-            for piece in pieces:
-                put((piece, None))
-                if stop.is_set():
-                    break
-            put((_END, None))
-        except BaseException as error:   # handed over to the consumer
-            put((_END, error))
+            while (piece := waiting.popleft().result()) is not _END:
+                waiting.append(thread.submit(next, pieces, _END))
+                yield piece
         finally:
-            pieces.close()
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        while True:
-            piece, error = waiting.get()
-            if error is not None:
-                raise error
-            if piece is _END:
-                return
-            yield piece
-    finally:
-        stop.set()
-        thread.join()
+            thread.shutdown(cancel_futures=True)
