@@ -159,12 +159,6 @@ class Recording:
         return {topic.name: topic.count for topic in self.topics}
 
     @property
-    def n_messages(self) -> int:
-        """Messages on the chosen topics by the recording's metadata; for progress."""
-        counts = self.message_counts
-        return sum(counts[name] for name in (self.imu_topic, self.joint_topic, self.temperature_topic) if name)
-
-    @property
     def duration(self) -> float:
         """Seconds between the first and the last message by the recorder's clock."""
         return self.source.duration_ns * 1e-9

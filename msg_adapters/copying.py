@@ -14,7 +14,7 @@ from msg_adapters.bag_writer import BagWriter
 from msg_adapters.decode import FrameChoice, in_order
 from msg_adapters.definitions import is_standard, standard_definition
 from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, patch_imu_group
-from msg_adapters.layout import Packed, from_ns, group_by_layout
+from msg_adapters.layout import NS_PER_S, Packed, group_by_layout
 
 
 def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike[str], imu_topic: str, *, corrected_topic: str,
@@ -126,7 +126,8 @@ class _Patch:
             fields = self._fields(layout, group, (corrected.force[place], corrected.rate[place]), corrected.marks[place])
             table = patch_imu_group(layout, group, fields, frame_id=self.frame_id)
             if self.late_ns:
-                _set_stamps(table, layout.order, layout.stamp_ns(group) - self.late_ns)
+                for place, values, kind in zip((4, 8), np.divmod(layout.stamp_ns(group) - self.late_ns, NS_PER_S), 'iu', strict=True):
+                    table[:, place:place + 4] = values.astype(f'{layout.order}{kind}4').view(np.uint8).reshape(-1, 4)
             tables.append(Packed.of_rows(table))
         return done, [Packed.chain(tables).select(order)]
 
@@ -157,11 +158,6 @@ class _Patch:
         if given.any():
             turned[given] = (Rotation.from_quat(quaternion[given]) * Rotation.from_matrix(self.mat_st)).as_quat()
         return turned
-
-
-def _set_stamps(table, order, stamp_ns):
-    for place, values, kind in zip((4, 8), from_ns(stamp_ns), 'iu', strict=True):
-        table[:, place:place + 4] = values.astype(f'{order}{kind}4').view(np.uint8).reshape(-1, 4)
 
 
 def _propagated(propagate, pairs):

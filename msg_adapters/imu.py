@@ -7,7 +7,6 @@ import numpy as np
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from msg_adapters.layout import (
     FRAME_OFFSET,
-    Header,
     MessageError,
     MessageLayout,
     Packed,
@@ -26,10 +25,17 @@ FIELDS = {'orientation': slice(0, 4), 'orientation_cov': slice(4, 13), 'rate_s':
 
 def find_imu_layout(data: bytes) -> MessageLayout:
     """Return the MessageLayout of a serialized Imu message (raises MessageError)."""
-    header, body = open_message(data)
-    offsets = {name: (body + 8 * place.start, place.stop - place.start) for name, place in FIELDS.items()}
-    fixed = ((0, 2), (FRAME_OFFSET, header.end))
-    return MessageLayout(header.order, len(data), bytes(data), fixed, offsets, (header.frame_id,))
+    return _layout(data, 'Imu', N_DOUBLES, {name: (place.start, place.stop - place.start) for name, place in FIELDS.items()})
+
+
+def _layout(data, kind, n_doubles, fields):
+    """Return the MessageLayout of a message with doubles after its header; `fields` are name -> (index of the first, number)."""
+    header = open_header(data)
+    body = aligned(header.end, 8)
+    if len(data) < body + 8 * n_doubles:
+        raise MessageError(f'a message of type {kind} with its doubles at byte {body} has {body + 8 * n_doubles} bytes, got {len(data)}')
+    offsets = {name: (body + 8 * first, count) for name, (first, count) in fields.items()}
+    return MessageLayout(header.order, len(data), bytes(data), ((0, 2), (FRAME_OFFSET, header.end)), offsets, (header.frame_id,))
 
 
 def decode_imu(layout: MessageLayout, packed: Packed) -> ImuSamples:
@@ -69,26 +75,11 @@ def patch_imu_group(layout: MessageLayout, packed: Packed, fields: dict[str, np.
         table[:, offset:offset + 8 * count] = np.ascontiguousarray(values, dtype=layout.order + 'f8').view(np.uint8)
     if frame_id is None or frame_id == layout.names[0]:
         return table
-    body = layout.offsets['orientation'][0]
-    sample, new_body = reframed(layout.sample, layout.order, body, frame=frame_id.encode())
-    head = np.broadcast_to(np.frombuffer(sample[FRAME_OFFSET:new_body], np.uint8), (len(table), new_body - FRAME_OFFSET))
-    return np.concatenate([table[:, :FRAME_OFFSET], head, table[:, body:]], axis=1)
-
-
-def open_message(data: bytes, kind: str = 'Imu', n_doubles: int = N_DOUBLES) -> tuple[Header, int]:
-    """Check the bytes of a message with doubles after its header and return (Header, offset of the doubles)."""
-    header = open_header(data)
-    body = aligned(header.end, 8)
-    if len(data) < body + 8 * n_doubles:
-        raise MessageError(f'a message of type {kind} with its doubles at byte {body} has {body + 8 * n_doubles} bytes, got {len(data)}')
-    return header, body
-
-
-def reframed(data: bytes, order: str, body: int, *, frame: bytes) -> tuple[bytes, int]:
-    """Return the message with another frame_id and the new offset of its doubles."""
-    new_body = aligned(FRAME_OFFSET + 4 + len(frame) + 1, 8)
-    head = bytes(data[:FRAME_OFFSET]) + struct.pack(order + 'I', len(frame) + 1) + frame + b'\0'
-    return head.ljust(new_body, b'\0') + bytes(data[body:]), new_body
+    text = frame_id.encode() + b'\0'
+    head = struct.pack(layout.order + 'I', len(text)) + text
+    head = head.ljust(aligned(FRAME_OFFSET + len(head), 8) - FRAME_OFFSET, b'\0')
+    rows = np.broadcast_to(np.frombuffer(head, np.uint8), (len(table), len(head)))
+    return np.concatenate([table[:, :FRAME_OFFSET], rows, table[:, layout.offsets['orientation'][0]:]], axis=1)
 
 
 TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
@@ -96,10 +87,7 @@ TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
 
 def find_temperature_layout(data: bytes) -> MessageLayout:
     """Return the MessageLayout of a serialized Temperature message (raises MessageError)."""
-    header, body = open_message(data, 'Temperature', 2)
-    fixed = ((0, 2), (FRAME_OFFSET, header.end))
-    return MessageLayout(header.order, len(data), bytes(data), fixed, {'temperature_c': (body, 1)},
-                         (header.frame_id,))
+    return _layout(data, 'Temperature', 2, {'temperature_c': (0, 1)})
 
 
 def decode_temperature(layout: MessageLayout, packed: Packed) -> TemperatureSamples:

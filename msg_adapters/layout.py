@@ -159,11 +159,6 @@ def overlapping(buffer: np.ndarray, dtype: str) -> np.ndarray:
     return np.ndarray((max(len(buffer) - dtype.itemsize + 1, 0),), dtype, buffer, strides=(1,))
 
 
-def is_any(values: np.ndarray, wanted: Sequence[float]) -> np.ndarray:
-    """Return where an integer array equals one of a few numbers."""
-    return np.logical_or.reduce([values == number for number in wanted]) if wanted else np.zeros(len(values), dtype=bool)
-
-
 def _checks(fixed, sample):
     """Cover the fixed bytes by few 8-byte words inside the message: (offset, mask, expected value)."""
     left = np.zeros(len(sample), dtype=bool)
@@ -252,19 +247,9 @@ def open_header(data: bytes) -> Header:
     end = FRAME_OFFSET + 4 + length
     if end > len(data):
         raise MessageError(f'a frame_id of {length} bytes ends at byte {end}, the message has {len(data)}')
-    return Header(order, to_ns(sec, nanosec), bytes(data[FRAME_OFFSET + 4:end - 1 if length else end]), end)
+    return Header(order, sec * NS_PER_S + nanosec, bytes(data[FRAME_OFFSET + 4:end - 1 if length else end]), end)
 
 
 def aligned(position: int, size: int) -> int:
     """Return the first position from `position` on that CDR aligns to `size`; positions count from the start of the message."""
     return position + (ENCAPSULATION_SIZE - position) % size
-
-
-def to_ns(sec: int, nanosec: int) -> int:
-    """Return the stamp as integer nanoseconds; works on numbers and on int64 arrays."""
-    return sec * NS_PER_S + nanosec
-
-
-def from_ns(stamp_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (sec, nanosec) of an integer stamp; works on numbers and on int64 arrays."""
-    return stamp_ns // NS_PER_S, stamp_ns % NS_PER_S

@@ -195,7 +195,7 @@ class McapFile(StorageFile):
         self.file = open_regular(path)
         self.size = os.fstat(self.file.fileno()).st_size
         self.schemas, self.channels, self.lost = {}, {}, {}
-        self.chunk_starts, self.complete, self.n_unpacked = [], False, 0
+        self.chunk_starts, self.n_unpacked = [], 0
         self.statistics: Any = None
         try:
             if self._read(0, len(MAGIC)) != MAGIC:
@@ -359,7 +359,6 @@ class McapFile(StorageFile):
         if len(footer) < FOOTER_SIZE + len(MAGIC) or footer[FOOTER_SIZE:] != MAGIC or footer[0] != FOOTER:
             return
         start, = struct.unpack_from('<Q', footer, PREFIX.size)
-        self.complete = True
         if not len(MAGIC) <= start < self.size:
             return
         summary = memoryview(self._read(start, self.size - start))

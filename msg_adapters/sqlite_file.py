@@ -150,10 +150,12 @@ class SqliteFile(StorageFile):
 
     def _rows_by_sql(self):
         cursor = iter(self.connection.execute('SELECT topic_id, timestamp, data FROM messages ORDER BY id'))
-        going = True
-        while going:
-            rows = []
-            going = self._fetch(cursor, rows)
+        while True:
+            rows: list[Any] = []
+            try:
+                rows.extend(islice(cursor, STRETCH_ROWS))
+            except sqlite3.Error as error:
+                self._lose(f'rest after damage ({error})', 1)
             usable = [row for row in rows if tuple(map(type, row)) == (int, int, bytes)]
             if len(usable) < len(rows):
                 self._lose('rows with values of other types', len(rows) - len(usable))
@@ -161,15 +163,8 @@ class SqliteFile(StorageFile):
                 ids, received, messages = zip(*usable, strict=True)
                 packed, received = Packed.join(messages), np.array(received, dtype=np.int64)
                 yield Stretch(np.array(ids), lambda index, packed=packed: (index, packed.select(index)), received.__getitem__)
-
-    def _fetch(self, cursor, rows):
-        """Append a stretch of rows; return whether there may be more."""
-        try:
-            rows.extend(islice(cursor, STRETCH_ROWS))
-        except sqlite3.Error as error:
-            self._lose(f'rest after damage ({error})', 1)
-            return False
-        return len(rows) == STRETCH_ROWS
+            if len(rows) < STRETCH_ROWS:   # the end, or damage
+                return
 
 
 def _connect(path, logged):

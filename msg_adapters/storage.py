@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from msg_adapters.layout import Packed, is_any
+from msg_adapters.layout import Packed
 
 LARGEST_STRETCH = 64 << 20
 """Bytes of the messages of a stretch when they are decompressed one by one."""
@@ -69,7 +69,7 @@ class StorageFile:
         for stretch in self._stretches(topics):
             code = np.full(len(stretch.topic_ids), -1)
             for number, topic in enumerate(topics):
-                code[is_any(stretch.topic_ids, self.topic_ids.get(topic, []))] = number
+                code[np.isin(stretch.topic_ids, self.topic_ids.get(topic, []))] = number
             mine = np.flatnonzero(code >= 0)
             if len(mine):
                 mine, packed = self._take(stretch, mine)

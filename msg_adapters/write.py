@@ -14,7 +14,7 @@ from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import DEFAULT_TOPICS, standard_definition
 from msg_adapters.imu import FIELDS, IMU_TYPE, N_DOUBLES, TEMPERATURE_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, encode_trajectory
-from msg_adapters.layout import Packed, from_ns
+from msg_adapters.layout import NS_PER_S, Packed
 
 NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0)
 UNKNOWN_COVARIANCE = (0.0,) * 9
@@ -22,8 +22,7 @@ ABSENT_COVARIANCE = (-1.0,) + (0.0,) * 8
 """Covariances: all zeros means unknown, -1 first means that the message does not hold the quantity."""
 
 
-def encode_imu(imu: ImuSamples, frame_id: str | None = None, force_cov: ArrayLike = UNKNOWN_COVARIANCE, *,
-               rate_cov: ArrayLike = UNKNOWN_COVARIANCE) -> np.ndarray:
+def encode_imu(imu: ImuSamples, *, force_cov: ArrayLike = UNKNOWN_COVARIANCE, rate_cov: ArrayLike = UNKNOWN_COVARIANCE) -> np.ndarray:
     """
     Serialize ImuSamples; the orientation is declared absent.
 
@@ -38,29 +37,24 @@ def encode_imu(imu: ImuSamples, frame_id: str | None = None, force_cov: ArrayLik
                'rate_cov': np.ravel(rate_cov), 'force_cov': np.ravel(force_cov)}
     for name, value in columns.items():
         doubles[:, FIELDS[name]] = value
-    return _table(imu.stamp_ns, _head(imu.frame_id if frame_id is None else frame_id, 8), [doubles])
+    return _table(imu.stamp_ns, _head(imu.frame_id, 8), [doubles])
 
 
-def encode_joints(joints: JointSamples, frame_id: str = '', with_velocity: bool = True) -> np.ndarray:
+def encode_joints(joints: JointSamples, with_velocity: bool = True) -> np.ndarray:
     """Serialize JointSamples (see `encode_imu`), with an empty sequence of velocities when these are left out."""
-    names = b''
-    for name in joints.names:
-        names = _padded(names, 4) + _string(name)
-    head = _head(frame_id, 4) + struct.pack('<I', len(joints.names)) + names
     count = struct.pack('<I', len(joints.names))
-    pieces: list[Any] = [joints.position]
-    if with_velocity and joints.names:
-        pieces += [count + bytes(4), joints.velocity]
-    else:
-        pieces += [bytes(4)]
-    return _table(joints.stamp_ns, _padded(_padded(head, 4) + count, 8 if joints.names else 4), [*pieces, bytes(4)])
+    head = _head('', 4) + count
+    for name in joints.names:
+        head = _padded(head + _string(name), 4)
+    velocity = [count + bytes(4), joints.velocity] if with_velocity and joints.names else [bytes(4)]
+    return _table(joints.stamp_ns, _padded(head + count, 8 if joints.names else 4), [joints.position, *velocity, bytes(4)])
 
 
-def encode_temperature(temperature: TemperatureSamples, frame_id: str = '') -> np.ndarray:
+def encode_temperature(temperature: TemperatureSamples) -> np.ndarray:
     """Serialize TemperatureSamples (see `encode_imu`); the variance is unknown, 0."""
     doubles = np.zeros((len(temperature), 2), dtype='<f8')
     doubles[:, 0] = temperature.temperature_c
-    return _table(temperature.stamp_ns, _head(frame_id, 8), [doubles])
+    return _table(temperature.stamp_ns, _head('', 8), [doubles])
 
 
 def rows(table: np.ndarray) -> list[memoryview]:
@@ -88,8 +82,7 @@ def _table(stamp_ns, head, pieces):
     """Lay encapsulation, stamp, `head` and the pieces (constant bytes, or doubles per row) side by side."""
     n = len(stamp_ns)
     stamps = np.empty((n, 2), dtype='<i4')
-    sec, nanosec = from_ns(np.asarray(stamp_ns, dtype=np.int64))
-    stamps[:, 0], stamps[:, 1] = sec, nanosec
+    stamps[:, 0], stamps[:, 1] = np.divmod(np.asarray(stamp_ns, dtype=np.int64), NS_PER_S)
     columns = [_constant(b'\0\x01\0\0', n), stamps.view(np.uint8), _constant(head, n)]
     for piece in pieces:
         columns.append(_constant(piece, n) if isinstance(piece, bytes) else np.ascontiguousarray(piece, dtype='<f8').view(np.uint8))

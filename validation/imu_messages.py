@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msg_adapters.imu import FIELDS, N_DOUBLES, open_message, reframed
+from msg_adapters.imu import FIELDS, N_DOUBLES, find_imu_layout
+from msg_adapters.layout import FRAME_OFFSET, aligned, open_header
 
 
 class ImuMessage(NamedTuple):
@@ -30,7 +31,7 @@ def parse_imu(data: bytes) -> ImuMessage:
         When the bytes are not a plain CDR Imu message.
 
     """
-    header, body = open_message(data)
+    header, body = open_header(data), find_imu_layout(data).offsets['orientation'][0]
     return ImuMessage(header.stamp_ns, header.frame_id, struct.unpack_from(f'{header.order}{N_DOUBLES}d', data, body))
 
 
@@ -48,10 +49,13 @@ def patch_imu(data: bytes, frame_id: str | None = None, **fields: Sequence[float
         Values by the names of `FIELDS`; covariances as 3 x 3 or as nine numbers.
 
     """
-    header, body = open_message(data)
+    header, body = open_header(data), find_imu_layout(data).offsets['orientation'][0]
     order = header.order
     if frame_id is not None and frame_id.encode() != header.frame:
-        data, body = reframed(data, order, body, frame=frame_id.encode())
+        frame = frame_id.encode() + b'\0'
+        new_body = aligned(FRAME_OFFSET + 4 + len(frame), 8)
+        data = (data[:FRAME_OFFSET] + struct.pack(order + 'I', len(frame)) + frame).ljust(new_body, b'\0') + data[body:]
+        body = new_body
     patched = bytearray(data)
     for name, value in fields.items():
         value = np.asarray(value, dtype=float).ravel()

@@ -73,8 +73,7 @@ RESET_NS = 1_000_000_000
 
 MAX_SUM_AGE = 1000
 """The running sums are recomputed after this many samples, so that rounding does not accumulate."""
-
-
+NO_SLOPE = (0.0, 0.0, 0.0)
 WHOLE_GAP_SHARE, MAX_LATE_STEP = 0.25, 3.5
 """A longer step is a gap if it is within this share of a whole number of periods, or longer than this many of them."""
 
@@ -101,14 +100,11 @@ class StampedDerivative:
         self._period_ns = derivative.period * 1e9
         self._least = max(2, (self.taps + 1) // 2)
         self._scale = [0.0, 0.0, *(12.0 / (n * (n * n - 1.0)) / self.period for n in range(2, self.taps + 1))]
-        self._zero = (0.0, 0.0, 0.0)
-        self.resets = -1
         self._restart()
         self._newest: int | None = None
-        self.alpha = self._zero
+        self.alpha: tuple = NO_SLOPE
 
     def _restart(self):
-        self.resets += 1
         self._window = deque()
         self._sums = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._age = 0
@@ -126,7 +122,7 @@ class StampedDerivative:
         self._add(x, y, z)
         n = len(self._window)
         if n < self._least:
-            self.alpha = self._zero
+            self.alpha = NO_SLOPE
         else:
             sx, sy, sz, px, py, pz = self._sums
             middle, scale = 0.5 * (n - 1), self._scale[n]
@@ -179,14 +175,11 @@ class StampedDerivative:
         steps = np.diff(stamp_ns) / self._period_ns
         bounds = np.concatenate([[0], 1 + np.flatnonzero((steps <= MIN_REGULAR_STEP) | (steps > MAX_REGULAR_STEP)), [len(values)]])
         for start, end in zip(bounds[:-1].tolist(), bounds[1:].tolist()):
-            lead = min(end, start + self.taps + 1)
-            for k in range(start, lead):
+            for k in range(start, end):
+                if k == start + self.taps + 1 and self._newest == stamp_ns[k - 1]:
+                    self._regular(stamp_ns, values, k, end, out)
+                    break
                 out[k] = self.push(int(stamp_ns[k]), *values[k].tolist())
-            if lead < end and self._newest == stamp_ns[lead - 1]:
-                self._regular(stamp_ns, values, lead, end, out)
-            else:
-                for k in range(lead, end):
-                    out[k] = self.push(int(stamp_ns[k]), *values[k].tolist())
         return out
 
     def _regular(self, stamp_ns, values, start, end, out):
@@ -221,7 +214,7 @@ class TimedDerivative:
         self._enough = self.taps * (self.taps**2 - 1) / 12 * self.period**2 * 1e18
         self._stamps: deque[int] = deque()
         self._values: deque[tuple] = deque()
-        self.alpha = (0.0, 0.0, 0.0)
+        self.alpha: tuple = NO_SLOPE
 
     def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple[float, float, float]:
         """Return the derivative (x, y, z) after one more sample, per second."""
@@ -241,7 +234,7 @@ class TimedDerivative:
             self._stamps.popleft()
             self._values.popleft()
         if 8 * spread[n - 1] < self._enough:
-            self.alpha = (0.0, 0.0, 0.0)
+            self.alpha = NO_SLOPE
         else:
             values = np.array(self._values)[::-1]
             self.alpha = tuple((-1e9 * (past[:n] - past[:n].mean()) @ values / spread[n - 1]).tolist())

@@ -70,35 +70,26 @@ class Uncertainty:
     ----------
     calibration : Calibration
     transfer : compensation.Transfer, optional
-    derivative : differentiation.CausalDerivative, optional
-        Source of the angular acceleration; None: it is not used.
-    period : float, optional
-        Time between samples, s, for a calibration with a noise density.
 
     """
 
-    def __init__(self, calibration: FittedErrors, transfer: Transfer | None = None, derivative: CausalDerivative | None = None, *,
-                 period: float | None = None):
+    def __init__(self, calibration: FittedErrors, transfer: Transfer | None = None):
         self._model, self._values = invertible_values(calibration)
         self._kernel, self._inside = make_kernel(calibration, transfer), make_kernel(calibration)
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
-        index = [np.arange(len(calibration.values))[calibration.model.slices[e.key]] for e in self._model.effects]
-        index = np.concatenate(index)
+        index = np.concatenate([np.arange(len(calibration.values))[calibration.model.slices[e.key]] for e in self._model.effects])
         self._covariance = calibration.covariance[np.ix_(index, index)]
-        self._slopes = [self._coefficient_slopes(sensor) for sensor in SENSORS]
+        steps = 1e-30j * np.eye(len(self._values))   # complex steps give d(coefficients) / d(parameters), shape (n_params, n_columns, 3)
+        self._slopes = [np.stack([coefficients_at_point(self._model, sensor, self._values + step).imag / 1e-30 for step in steps])
+                        for sensor in SENSORS]
         self._calibration = calibration
-        self.use(derivative, period)
+        self.use(None)
 
     def use(self, derivative: CausalDerivative | None, period: float | None = None) -> None:
         """Use the angular acceleration of another CausalDerivative, or of none, and the noise of samples `period` s apart."""
         self.noise = tuple(np.diag(self._calibration.noise(sensor, period)[0]**2) for sensor in SENSORS)
         weights = np.zeros(1) if derivative is None else derivative.weights
         self._newest, self._earlier = float(weights[0]), float((weights[1:]**2).sum())
-
-    def _coefficient_slopes(self, sensor):
-        """Return d(coefficients) / d(parameters), shape (n_params, n_columns, 3), by complex steps."""
-        steps = 1e-30j * np.eye(len(self._values))
-        return np.stack([coefficients_at_point(self._model, sensor, self._values + step).imag / 1e-30 for step in steps])
 
     def at(self, force: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 9.8),
            rate: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0),
@@ -124,8 +115,7 @@ class Uncertainty:
         sample, beside = np.concatenate([force, rate, derivative]), (dt, branch, *vibration)
         gain = np.stack([self._slope(sample, step, beside) for step in np.diag(DIFFERENCE_STEPS)], axis=1)
         true = self._inside(*sample.tolist(), *beside)
-        jacobian = self._parameter_slopes(np.array(true), self._inverse_rate @ sample[6:], beside)
-        jacobian = gain[:, :6] @ jacobian
+        jacobian = gain[:, :6] @ self._parameter_slopes(np.array(true), self._inverse_rate @ sample[6:], beside)
         return Sensitivity(gain, jacobian @ self._covariance @ jacobian.T, self._newest, self._earlier, slope_error or SlopeError())
 
     def _slope(self, sample, step, beside):

@@ -10,6 +10,7 @@ from imu_calibration.compensation.compensate import FittedErrors, Transfer
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.core.progress import LiveState
 from imu_calibration.core.units import DEG, GRAVITY_PLACE_SHARE, STANDARD_GRAVITY, unit_of_rest
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.rotations import EARTH_RATE
 
 HEALTH_BLOCK_SECONDS = 0.25
@@ -114,10 +115,9 @@ class StopDetector:
     def _is_still(self):
         if len(self._blocks) < N_BLOCKS:
             return False
-        means = np.array([mean[:6] for _, _, _, mean, _ in self._blocks])
         shake = np.sqrt(np.max([variance for *_, variance in self._blocks], axis=0))
         least = min(n for _, _, n, _, _ in self._blocks)
-        apart = np.ptp(means, axis=0)
+        apart = np.ptp([mean[:6] for _, _, _, mean, _ in self._blocks], axis=0)
         # Vibration of the robot is noise for the means as well.
         allowed = MAX_BLOCK_CHANGE + TIMES_NOISE * np.maximum(self._noise_sd, shake) / np.sqrt(least)
         return bool((apart <= allowed).all() and (shake**2 <= self._most_variance).all())
@@ -166,7 +166,7 @@ class GyroBiasUpdate:
         """Return (bias, its variance) at `now`, s; rad/s and its square, each shape (3,)."""
         return self._now.after(now, self._time)[:2]
 
-    def measure(self, start: float, now: float, *, rate: np.ndarray, variance: np.ndarray) -> bool:
+    def measure(self, start: float, now: float, *, rate: np.ndarray, variance: np.ndarray) -> None:
         """
         Process the mean of the corrected rate over a stop until now; as the stop grows, the longer mean replaces the shorter one.
 
@@ -179,14 +179,7 @@ class GyroBiasUpdate:
         variance : ndarray, shape (3,)
             Of that mean; the Earth's rate is added here.
 
-        Returns
-        -------
-        bool
-            Whether it was accepted: a mean beyond any change of bias is a slow rotation.
-
         """
-        if np.linalg.norm(rate) > MOST_MOVED:
-            return False
         if start != self._stop:
             self._stop, self._before, self.n_stops = start, self._now, self.n_stops + 1
         variance = variance + EARTH_RATE**2 / 3   # about axes that are unknown here
@@ -196,7 +189,6 @@ class GyroBiasUpdate:
         spread = spread + np.maximum(stationary - self._before.stationary, 0)   # it has been as wide before anybody saw it
         gain = spread / (spread + variance)
         self._now = _State(bias + gain * (rate - bias), (1 - gain) * spread, stationary, seen, weight, now)
-        return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,13 +273,11 @@ class CalibrationHealth:
 
     def __init__(self, calibration: FittedErrors, transfer: Transfer | None, options: HealthOptions):
         self.options, self.n_stops = options, 0
-        sensors = ('accelerometer', 'gyroscope')
-        found = [calibration.noise(sensor) for sensor in sensors]
+        found = [calibration.noise(sensor) for sensor in SENSORS]
         turn = np.eye(3) if transfer is None else transfer.mat_ts
         self.noise_sd = np.concatenate([np.sqrt(turn**2 @ np.square(sd)) for sd, _ in found])
         wander = np.repeat([float(np.max(offset))**2 for _, offset in found], 3)
-        parameters = Uncertainty(calibration, transfer).at().parameters
-        self._known = parameters + np.diag(wander)
+        self._known = Uncertainty(calibration, transfer).at().parameters + np.diag(wander)
         given = options.gravity or calibration.conditions.get('gravity')
         self._gravity, self._place = float(given or STANDARD_GRAVITY), 0.1 * GRAVITY_PLACE_SHARE if options.gravity else GRAVITY_PLACE_SHARE
         self.update = GyroBiasUpdate(np.sqrt(np.diag(self._known)[3:]), options.bias_time) if options.update else None

@@ -47,8 +47,7 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
         If an effect to be inverted has columns that a single sample does not determine.
 
     """
-    namespace = dict(SCALAR_FUNCTIONS)
-    text = kernel_text(calibration, transfer)
+    namespace, text = dict(SCALAR_FUNCTIONS), kernel_text(calibration, transfer)
     if len(text) > MAX_KERNEL_CHARACTERS:
         raise InputError(f'the effects of a calibration must expand to at most {MAX_KERNEL_CHARACTERS} characters of arithmetic, got '
                          f'{len(text)}; use fewer or shorter effects')

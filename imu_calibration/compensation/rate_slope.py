@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imu_calibration.compensation.angular_acceleration import RESET_NS, CausalDerivative, StampedDerivative, TimedDerivative
+from imu_calibration.compensation.angular_acceleration import NO_SLOPE, RESET_NS, CausalDerivative, StampedDerivative, TimedDerivative
 from imu_calibration.preprocessing import stamping
 from imu_calibration.preprocessing.stamping import CLOCK_BLOCK, COUNTED, IRREGULAR, LAG, PAUSE_NS, REGULAR, StampLine, describe_stamps
 
@@ -22,7 +22,6 @@ RECENT_SPAN = 1.0, 64, 2048
 """Seconds, smallest and largest number of samples from which the error of the derivative is estimated."""
 ROUGH = 0.02
 """Seconds over which the rate is compared where there is no derivative: the longest delay that a derivative may have."""
-NO_SLOPE = (0.0, 0.0, 0.0)
 WITHOUT = ': no angular acceleration, the lever-arm effect is not corrected and the covariance includes its size'
 """Consequence of frozen stamps."""
 

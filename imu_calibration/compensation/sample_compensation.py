@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.compensation.angular_acceleration import NO_SLOPE
 from imu_calibration.compensation.compensate import FittedErrors, Transfer, invertible, saturation_level
 from imu_calibration.compensation.covariance import Uncertainty, is_known
 from imu_calibration.compensation.kernel import make_kernel
-from imu_calibration.compensation.rate_slope import NO_SLOPE, RateSlope
+from imu_calibration.compensation.rate_slope import RateSlope
 from imu_calibration.compensation.stream import derivative_for, uses_slope
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch

@@ -21,6 +21,12 @@ EFFECTS = {'usual': (('accel_size_effect',), ()), 'all': (FURTHER['accelerometer
 N_DRAWS = 4000
 
 
+def with_derivative(calibration, transfer=None):
+    uncertainty = Uncertainty(calibration, transfer)
+    uncertainty.use(DERIVATIVE)
+    return uncertainty
+
+
 def agree(sampled, predicted):
     """Sample covariances of N draws scatter by about sqrt(2 / N) = 2 %; five times that."""
     scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
@@ -38,7 +44,7 @@ def test_noise_agrees_with_monte_carlo(effects, transfer):
     slope = SLOPE + np.einsum('k,nki->ni', DERIVATIVE.weights, rates)
     rows = np.column_stack([force, RATE + rates[:, 0], slope, np.full(N_DRAWS, DT)])
     out = np.array([kernel(*row) for row in rows.tolist()])
-    sensitivity = Uncertainty(calibration, transfer, DERIVATIVE).at(FORCE, RATE, SLOPE, dt=DT)
+    sensitivity = with_derivative(calibration, transfer).at(FORCE, RATE, SLOPE, dt=DT)
     for got, predicted in zip((out[:, :3], out[:, 3:]), sensitivity.covariances(FORCE_COV, RATE_COV, with_parameters=False)):
         agree(np.cov(got.T), predicted)
 
@@ -51,7 +57,7 @@ def test_parameters_agree_with_monte_carlo(effects, transfer):
     draws = rng.multivariate_normal(calibration.values, calibration.covariance, 300)
     sample = [*np.concatenate([FORCE, RATE, SLOPE]).tolist(), DT]
     out = np.array([make_kernel(replace(calibration, values=values), transfer)(*sample) for values in draws])
-    predicted = Uncertainty(calibration, transfer, DERIVATIVE).at(FORCE, RATE, SLOPE, dt=DT).parameters
+    predicted = with_derivative(calibration, transfer).at(FORCE, RATE, SLOPE, dt=DT).parameters
     scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
     # 300 draws: 8 %, four times that; the derivative of the inverse gyroscope matrix in the tangential term is left out.
     assert np.abs((np.cov(out.T) - predicted) / scale).max() < 0.35
@@ -61,7 +67,7 @@ def test_what_is_published_has_the_share_of_the_parameters():
     """It is there, and grows with their variance: by a hundred from 1e-4 to 1e-3."""
     shares = []
     for sd in (1e-4, 1e-3):
-        sensitivity = Uncertainty(random_calibration(1, sd=sd), None, DERIVATIVE).at(FORCE, RATE, SLOPE, dt=DT)
+        sensitivity = with_derivative(random_calibration(1, sd=sd)).at(FORCE, RATE, SLOPE, dt=DT)
         whole, noise_only = (sensitivity.covariances(FORCE_COV, RATE_COV, flag) for flag in (True, False))
         shares.append([np.trace(a - b) for a, b in zip(whole, noise_only)])
     assert np.all(np.array(shares) > 0)

@@ -56,10 +56,8 @@ def test_a_long_hole_and_a_clock_set_back_start_the_window_anew(step_ns):
     stamps = 10**18 + PERIOD_NS * np.arange(20)
     tracked = tracker(4)
     one_by_one(tracked, stamps, ramp(stamps - stamps[0]))
-    assert tracked.resets == 0
     later = stamps[-1] + step_ns + PERIOD_NS * np.arange(6)
     alpha = one_by_one(tracked, later, ramp(later - later[0]) + 1e3)
-    assert tracked.resets == 1
     assert np.all(alpha[0] == 0.0)
     np.testing.assert_allclose(alpha[3:], np.broadcast_to([2.0, -3.0, 0.5], (3, 3)), atol=1e-8)
 

@@ -2,6 +2,7 @@
 
 import shutil
 import sqlite3
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -237,8 +238,8 @@ def test_bags_of_another_writer(tmp_path, session, storage, mode):
     imu, joints, _ = session
     imu, joints = imu.select(slice(0, 600)), joints.select(slice(0, 120))
     swapped = JointSamples(joints.stamp_ns, joints.position[:, ::-1], joints.velocity[:, ::-1], joints.names[::-1])
-    plain = [encode_imu(imu, frame_id=frame) for frame in ('a', 'another_frame')]
-    joint_rows = encode_joints(joints), encode_joints(swapped, 'frame', with_velocity=False)
+    plain = [encode_imu(replace(imu, frame_id=frame)) for frame in ('a', 'another_frame')]
+    joint_rows = encode_joints(joints), encode_joints(swapped, with_velocity=False)
     writer = Writer(tmp_path / 'bag', version=8, storage_plugin=storage)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:

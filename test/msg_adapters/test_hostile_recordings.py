@@ -3,6 +3,7 @@
 import os
 import sqlite3
 import struct
+from dataclasses import replace
 from types import SimpleNamespace
 
 import lz4.frame
@@ -270,7 +271,7 @@ def decode_long_names(imu):
     """Decode messages of long names; return 0."""
     from imu_calibration.core.samples import ImuSamples, JointSamples
     imu = ImuSamples(imu.stamp_ns, imu.force_s, imu.rate_s)
-    messages = [encode_imu(imu.select(slice(k, k + 1)), frame_id='x' * (1 << 22) + str(k))[0].tobytes() for k in range(4)]
+    messages = [encode_imu(replace(imu.select(slice(k, k + 1)), frame_id='x' * (1 << 22) + str(k)))[0].tobytes() for k in range(4)]
     decoder = Decoder(IMU_TYPE)
     assert decoder.decode(Packed.join(messages)) is None and sum(decoder.dropped.values()) == 4
     names = tuple(f'joint_{k}' for k in range(100_000))
