@@ -40,11 +40,12 @@ def test_the_size_of_the_errors_is_estimated_and_their_scatter_removed(sd):
         assert np.median((own / jitter_ratio(own, steep, found.sd))[steep[:, 0] > 0]) == pytest.approx(noise, rel=0.15)
 
 
-def test_scatter_of_one_sensor_is_no_error_of_the_stamps():
-    rough, slope, freedom = blocks((1e-4, 0.0))
+@pytest.mark.parametrize('jitter', [(1e-4, 0.0), (0.0, 1e-4), (0.0, 5e-6)])
+def test_scatter_of_one_sensor_is_no_error_of_the_stamps(jitter):
+    """The other sensor shows none; at 5 us the precise sensor would decide the mean of both alone."""
+    rough, slope, freedom = blocks(jitter)
     found = stamp_jitter(rough, slope, freedom)
-    assert not found.significant and found.sd < 1e-5 and not found.lines
-    assert jitter_ratio(rough[0], slope[0], found.sd).max() < 1.2
+    assert not found.significant and found.sd < 0.7 * max(jitter) and not found.lines
 
 
 def test_no_jitter_changes_nothing():
