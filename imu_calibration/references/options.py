@@ -73,8 +73,5 @@ def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
 
 def settle_model(model: SensorModel, options: CalibrationOptions, gathered: SessionData) -> SensorModel:
     """Return the model without the size effect if it was not requested and the recording has no rotation that determines it."""
-    if options.accelerometer_model is not None:
-        return model
-    if gathered.accumulator.samples.get('spin', 0) + gathered.accumulator.samples.get('dynamic', 0) == 0:
-        return model.without_arms()
-    return model
+    turns = any(gathered.accumulator.samples.get(kind) for kind in ('spin', 'dynamic'))
+    return model if options.accelerometer_model is not None or turns else model.without_arms()

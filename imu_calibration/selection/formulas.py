@@ -1,5 +1,6 @@
 """Formulas of regressors for a residual: grammar, search, and evaluation."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,8 +11,7 @@ from scipy.linalg import svd
 
 from imu_calibration.core.distributions import chi2_sf
 from imu_calibration.effects.base import AXES, TEMPERATURE_RISE
-from imu_calibration.effects.expressions import FUNCTIONS, QUANTITY_OF, array_function, names_in, read
-from imu_calibration.kinematics.rotations import Reference
+from imu_calibration.effects.expressions import FUNCTIONS, PLACES, QUANTITY_OF, array_function, names_in, read
 from imu_calibration.selection.residual_blocks import RestBlocks
 from imu_calibration.selection.search import FAMILY_WISE, TIE
 
@@ -56,15 +56,9 @@ class Formula:
 
     def unit(self, output: str) -> str:
         """Return the unit of an amplitude, with `output` that of the sensor."""
-        per: dict[str, int] = {}
-        for factor in self.factors:
-            if factor in UNIT_OF:
-                per[UNIT_OF[factor]] = per.get(UNIT_OF[factor], 0) + 1
-        return output + ''.join(f'/{_bracketed(unit)}{"" if power == 1 else f"^{power}"}' for unit, power in per.items())
-
-
-def _bracketed(unit):
-    return f'({unit})' if '/' in unit else unit
+        per = Counter(UNIT_OF[factor] for factor in self.factors if factor in UNIT_OF)
+        powers = ((f'({unit})' if '/' in unit else unit, power) for unit, power in per.items())
+        return output + ''.join(f'/{unit}' if power == 1 else f'/{unit}^{power}' for unit, power in powers)
 
 
 @lru_cache(maxsize=16)
@@ -240,7 +234,10 @@ class FormulaSearch:
             self.known.append(int((sizes > 1.0).sum()))
 
     def _worked_out(self, texts, reference_temperature):
-        ref, places = self.blocks.ref, _values(self.blocks.ref, reference_temperature)
+        ref = self.blocks.ref
+        known = {name: (getattr(ref, field), index) for name, (field, *index) in PLACES.items() if field}
+        places = {name: values[:, *index] for name, (values, index) in known.items()
+                  if values is not None and (not index or index[-1] < values.shape[-1])} | {'temperature_ref_c': reference_temperature}
         means = np.empty((len(self.blocks.time), len(texts)))
         with np.errstate(all='ignore'):
             for first in range(0, len(texts), COLUMN_CHUNK):
@@ -312,16 +309,3 @@ class FormulaSearch:
 
 def _three(column):
     return (column,) * 3 if isinstance(column, str) else column
-
-
-def _values(ref: Reference, reference_temperature: float) -> dict:
-    """Return the values of the names in a formula."""
-    values = {'time': ref.time, 'temperature_ref_c': np.float64(reference_temperature)}
-    if ref.temperature_c is not None:
-        values['temperature_c'] = ref.temperature_c
-    for k, axis in enumerate('xyz'):
-        values |= {f'f_{axis}': ref.force_s[:, k], f'w_{axis}': ref.rate_s[:, k], f'alpha_{axis}': ref.alpha_s[:, k]}
-        values |= {f'c_{axis}{level}': ref.mat_sn[:, k, m] for m, level in enumerate('xyz')}
-    for k in range(ref.joint_angle.shape[1]):
-        values |= {f'angle_{k + 1}': ref.joint_angle[:, k], f'joint_rate_{k + 1}': ref.joint_rate[:, k]}
-    return values

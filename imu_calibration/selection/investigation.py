@@ -21,7 +21,7 @@ from imu_calibration.selection.onset import Onset, find_onset
 from imu_calibration.selection.questions import Question, point_with, testable_effects, without_saturation
 from imu_calibration.selection.rivals import Rival, best_pairs, same_questions, settle_rivals, simpler
 from imu_calibration.selection.saturation import Saturation, windows_at, without_clipping
-from imu_calibration.selection.search import Search, SelectedEffects
+from imu_calibration.selection.search import SelectedEffects
 
 LINEARISATIONS = 5
 """Largest number of linearisations."""
@@ -56,11 +56,6 @@ class Investigation(SelectedEffects):
     onset: Onset | None = None
     """Parameters that change at one moment: the other results are those of the longer part of the recording."""
 
-    @property
-    def search(self) -> Search:
-        """On which they were chosen."""
-        return self.problem.search
-
 
 def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, bias_processes: dict | None = None) -> Investigation:
     """
@@ -88,7 +83,7 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     used = [window for window in windows if window.kind != 'unused']
     if len(used) < MIN_FOLD_WINDOWS:
         raise too_few_windows(len(used))
-    model = with_joints_of(model, table)
+    model = replace(model, joint_names=table.joint_names)
     used, locked, limits = without_clipping(used, table, model)
     effects, not_testable = testable_effects(model, table, windows_at(used, ~locked))
     asked = without_saturation(effects)
@@ -99,7 +94,9 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     step = next((effect for effect in effects if effect.located), None)
     if onset is not None and onset.what == CLOCK and step is not None:
         stepped = partial(linearised_at, effects=[*asked, step])
-        there = stepped(point=point_with(model, [*asked, step], _as_step(step, onset)))
+        (name, before), = onset.before.items()
+        values = {name: before, **dict(zip(step.param_names(), (onset.after[name] - before, onset.time)))}
+        there = stepped(point=point_with(model, [*asked, step], values))
         other, others, beside = _explained(there, stepped, [question for question in there.questions if question.name == step.name])
         if other.rest < LEFT * outcome.rest:
             outcome, rivals, again, onset = other, others, beside, None
@@ -114,12 +111,6 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     rivals = [rival for rival in rivals if rival.question.name in names and rival.other.name not in names]
     rejected = [question for question in outcome.chosen if question not in (*named, *unstable)]
     return Investigation(used, problem, outcome.explained, named, limits, not_testable, unstable, rejected, rivals)
-
-
-def _as_step(step, onset):
-    """Return parameter -> value of a step of the clock at an onset."""
-    (name, before), = onset.before.items()
-    return {name: before} | dict(zip(step.param_names(), (onset.after[name] - before, onset.time)))
 
 
 def _explained(problem, linearised_at, start=()):
@@ -314,8 +305,3 @@ def _needed_reduction(problem, explained, chosen, question):
 def _sure_reduction(problem, chosen, question):
     """Return the lower end of the interval of an effect's reduction of the cross-validated residual."""
     return gain_in_turn(problem, [q for q in chosen if q is not question], chosen, sensors=sensors_of(question.effect)).ci95[0]
-
-
-def with_joints_of(model: SensorModel, table: Table) -> SensorModel:
-    """Return the model with the joints of the table."""
-    return model if model.joint_names == table.joint_names else replace(model, joint_names=table.joint_names)

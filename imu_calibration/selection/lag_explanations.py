@@ -130,13 +130,18 @@ def lag_explanations(problem: LinearisedProblem, chosen: Sequence[Question], lin
     effects = {effect.name: effect for effect in problem.effects}
     if not {question.name for question in chosen} & FAMILY or not FAMILY <= set(effects):
         return None
-    described = _described(problem, linearised_at, effects, rest=rest, clocks=_clocks(problem, chosen))
+    values, clocks = problem.values(chosen), [question for question in chosen if question.name in CLOCKS]
+    of_clocks = {problem.space.names[k]: float(values[k]) for question in clocks for k in question.parameters}
+    # Lags are nonlinear at a clock of zero where a clock changes.
+    described = _described(problem, linearised_at, effects, rest=rest, clocks=of_clocks or None)
     judges = [each.problem for each in described]
     names = [name for name in described[0].values if name.split('.')[1] not in FAMILY]
     explanations = _explanations(described, judges, names)
     if not explanations:
         return None
-    return LagExplanations(problem, explanations, rest, _silence(described, judges) if problem.recording.moving.all() else None)
+    without = [question for question in described[0].chosen if question.name not in FAMILY]
+    silent = sum(_cost(described[0], without, judges, sensor) for sensor in SENSORS) if problem.recording.moving.all() else None
+    return LagExplanations(problem, explanations, rest, silent)
 
 
 def simplest(explanations: Sequence[Explanation], silent: float | None = None) -> Explanation:
@@ -158,12 +163,6 @@ def simplest(explanations: Sequence[Explanation], silent: float | None = None) -
     common = [explanation for explanation in explanations if CLOCK in explanation.lags and len(explanation.lags) == len(selected.lags)
               and explanation.cost < best + TIE + MAX_CLOCK_LOSS * (silent - best)]
     return simplest(common) if common else selected
-
-
-def _clocks(problem, chosen):
-    """Return parameter -> value of the chosen clocks that change, None without one: their lags are nonlinear at zero."""
-    values, clocks = problem.values(chosen), [question for question in chosen if question.name in CLOCKS]
-    return {problem.space.names[k]: float(values[k]) for question in clocks for k in question.parameters} or None
 
 
 def _described(problem, linearised_at, effects, *, rest, clocks):
@@ -190,12 +189,6 @@ def _described(problem, linearised_at, effects, *, rest, clocks):
             hypothesis = at(kind, hypothesis.values)
         found.append(hypothesis)
     return found
-
-
-def _silence(described, judges):
-    """Return the held-out cost without any lag, nats."""
-    rest = [question for question in described[0].chosen if question.name not in FAMILY]
-    return sum(_cost(described[0], rest, judges, sensor) for sensor in SENSORS)
 
 
 def _explanations(described, judges, names):

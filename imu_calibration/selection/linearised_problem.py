@@ -70,7 +70,8 @@ class LinearisedProblem:
         model, values = point or _start(baseline, effects)
         model = replace(model, folded_arms=mean_arms(model, values))
         recording = reduce_recording(windows, table, model, values=values, bank=make_bank(effects, self.constants, model, values=values))
-        used, judged = baseline_parameters(baseline, model), recording.select(~locked)
+        used = tuple(k for e in baseline.effects for k in range(len(values))[model.slices[e.key]])
+        judged = recording.select(~locked)
         if point is None:
             judged = _at_baseline(judged, baseline, used)
             recording = recording.rebased(judged.values)
@@ -86,8 +87,7 @@ class LinearisedProblem:
     def asking_any_size(self) -> 'LinearisedProblem':
         """Return the same, asking about sizes that are known of no instrument too."""
         other = copy(self)
-        other.search = Search(self.evidence, self.search.baseline, self.questions, encoder_step=self.search.encoder_step, any_size=True,
-                              resolved=self.search.resolved)
+        other.search = self.search.asking_any_size()
         return other
 
     @property
@@ -194,11 +194,6 @@ class LinearisedProblem:
         curve = np.polyfit(logs - logs[1], losses, 2)
         shift = np.clip(-curve[1] / (2 * curve[0]), logs[0] - logs[1], logs[2] - logs[1]) if curve[0] > 0 else 0.0
         return np.append(values[list(question.parameters)], np.exp(logs[1] + shift))
-
-
-def baseline_parameters(baseline: SensorModel, model: SensorModel) -> tuple[int, ...]:
-    """Return the indices of the baseline's parameters in an extended model."""
-    return tuple(k for e in baseline.effects for k in range(model.slices[e.key].start, model.slices[e.key].stop))
 
 
 def _start(baseline, effects):

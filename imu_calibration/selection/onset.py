@@ -100,8 +100,9 @@ def find_onset(problem: LinearisedProblem, explained: ExplainedWindows, chosen: 
     units = {label: effect.unit_of(k) for effect in model.effects for k, label in enumerate(effect.param_names())}
     moment, moment_sd = _refined(windows, table, model, states=states, between=space.recording.time[ends])
     before, after = (dict(zip(names, state[group].tolist())) for state in states)
+    axes = () if name in _of_reference(model) else largest_axes(np.maximum(change**2 - sd**2, 0.0).reshape(-1, 3, 3).sum(axis=(0, 2)))
     return Onset(moment, moment_sd, name, before, after, dict(zip(names, sd.tolist())), {label: units[label] for label in names},
-                 1 - max(excess, 0.0) / single, () if name in _of_reference(model) else _axes_of(change, sd))
+                 1 - max(excess, 0.0) / single, axes)
 
 
 def _groups(model):
@@ -114,11 +115,6 @@ def _groups(model):
 
 def _of_reference(model):
     return {effect.name: model.slices[effect.key] for effect in model.effects if effect.sudden}
-
-
-def _axes_of(change, sd):
-    """Return the axes with the largest changes of the rows of matrices."""
-    return largest_axes(np.maximum(change**2 - sd**2, 0.0).reshape(-1, 3, 3).sum(axis=(0, 2)))
 
 
 def _fit(total, own, small, changed=None):

@@ -214,8 +214,12 @@ def smooth_parameters(asked: Sequence[Question]) -> dict[str, list[tuple[int, ..
 
 def normal_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None) -> np.ndarray:
     """Return the normal matrix of the windows `select` (mask; all where not given), shape (q + 1, q + 1)."""
-    return within_matrix(space, noise, select) + mean_matrix(space, {sensor: white_means(space, noise, sensor) for sensor in SENSORS},
-                                                             select)
+    of_means = np.zeros((space.size + 1, space.size + 1))
+    for sensor in SENSORS:
+        for axis, rows in enumerate(white_means(space, noise, sensor)):
+            rows, at = rows if select is None else rows[select], space.places(sensor, axis)
+            of_means[np.ix_(at, at)] += rows.T @ rows
+    return within_matrix(space, noise, select) + of_means
 
 
 def within_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None, *,
@@ -249,16 +253,6 @@ def matrix_of_each(space: ParameterSpace, noise: dict[str, NoiseModel]) -> np.nd
             own = rows[:, :, None] * rows[:, None, :]
             own[moving] += np.concatenate(list(space.within_each(sensor, axis, moving))) / variance[:, axis, None, None]
             total[:, at[:, None], at] += own
-    return total
-
-
-def mean_matrix(space: ParameterSpace, white: dict[str, list[np.ndarray]], select: np.ndarray | None = None) -> np.ndarray:
-    """Return the part from the means of the windows, from sensor -> `white_means`."""
-    total = np.zeros((space.size + 1, space.size + 1))
-    for sensor, axes in white.items():
-        for axis, rows in enumerate(axes):
-            rows, at = rows if select is None else rows[select], space.places(sensor, axis)
-            total[np.ix_(at, at)] += rows.T @ rows
     return total
 
 

@@ -10,7 +10,7 @@ from imu_calibration.effects.base import AXES, PREFIXES, SENSORS, Effect
 from imu_calibration.effects.catalogue import term
 from imu_calibration.estimation.observability import MOTIONS, TABLE_MOTIONS
 from imu_calibration.selection.explained_share import MIN_SMOOTH_SHARE
-from imu_calibration.selection.formulas import Formula, FormulaChoice, FormulaSearch, grammar
+from imu_calibration.selection.formulas import FormulaChoice, FormulaSearch, grammar
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.residual_blocks import RestBlocks
 from imu_calibration.selection.residual_fit import BlockFit, BlockFits, share_interval, share_removed
@@ -181,7 +181,9 @@ def _told(blocks, problem, fits, plain, choices):
     columns = np.concatenate([column for column, _, _ in terms], axis=1)
     after = fits.fit(columns)
     share = share_removed(plain, after)
-    effects = tuple(_effect(blocks.sensor, number, text, formula, after.amplitudes[number], _taken(problem))
+    alike = [_joined_text(f.columns[0]) + ' in any phase' * (len(f.columns) > 1) for f in choices[0].alike[:SHOWN_ALIKE]]
+    taken = {name for _, name in problem.baseline.catalogue.effects(problem.baseline.joint_names)}
+    effects = tuple(_effect(blocks.sensor, number, text, formula, after.amplitudes[number], taken)
                     for number, (_, text, formula) in enumerate(terms))
     seen = np.abs(after.amplitudes) > CONCERNED_SDS * after.sd
     rms = np.sqrt((columns**2).mean(axis=0))
@@ -191,7 +193,7 @@ def _told(blocks, problem, fits, plain, choices):
         blocks.sensor, effects, tuple(after.amplitudes), tuple(after.sd), frozenset().union(*(formula.family for _, _, formula in terms)),
         axes,
         share, share_interval(plain, after, np.random.default_rng(1)), 1.0 - float(np.sqrt(max(1.0 - share, 0.0))), choices[0].p_value,
-        tuple(_shown(formula) for formula in choices[0].alike[:SHOWN_ALIKE]), _nearest(fits, plain, problem), _motion(effects),
+        tuple(alike), _nearest(fits, plain, problem), _motion(effects),
         tuple(float(np.sqrt((rms[k]**2 * amplitude**2).sum())) for k, amplitude in enumerate(after.amplitudes)))
 
 
@@ -226,10 +228,6 @@ def _summed(columns, weights):
     return ' + '.join(f'{weight:g} * {column}' if weight != 1.0 else column for column, weight in zip(columns, weights) if weight)
 
 
-def _taken(problem):
-    return {name for _, name in problem.baseline.catalogue.effects(problem.baseline.joint_names)}
-
-
 def _effect(sensor, number, text, formula, values, taken):
     unit = formula.unit('m/s^2' if sensor == SENSORS[0] else 'rad/s')
     largest = float(np.abs(values).max())
@@ -251,10 +249,6 @@ def _joined_text(text):
 def _text_of(effect):
     column = effect.definition['column']
     return _joined_text(column if isinstance(column, str) else tuple(column))
-
-
-def _shown(formula: Formula) -> str:
-    return _joined_text(formula.columns[0]) + ' in any phase' * (len(formula.columns) > 1)
 
 
 def _size(effect, values, sd):

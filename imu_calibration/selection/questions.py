@@ -69,8 +69,7 @@ def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]
     have = {e.key for e in model.effects}
     branches = [float(window.motion.thermal_branch.mean()) for window in windows if window.motion.thermal_branch is not None]
     turned, shaken = bool(branches) and max(branches) - min(branches) >= BRANCHES_APART, _vibrates(windows)
-    return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds, span) or _not_turned(effect, turned)
-                        or _not_shaken(effect, shaken))
+    return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds=kinds, span=span, turned=turned, shaken=shaken))
 
 
 def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], list[dict]]:
@@ -106,19 +105,7 @@ def _vibrates(windows):
     return np.count_nonzero(variances > VIBRATES * variances.min(initial=np.inf)) >= SHAKEN_RESTS
 
 
-def _not_shaken(effect, shaken):
-    if 'vibration' in effect.needs and not shaken:
-        return 'it did not vibrate now more, now less at rest', f'record {SHAKEN_RESTS} rests and more while a machine on the table runs'
-    return None
-
-
-def _not_turned(effect, turned):
-    if 'cooling' in effect.needs and not turned:
-        return 'the temperature did not reverse: one branch only', f'record while it warms up and while it cools, by {TURN:g} K'
-    return None
-
-
-def _why_not(effect, have, table, kinds, span):
+def _why_not(effect, have, table, *, kinds, span, turned, shaken):
     moving = kinds & {'spin', 'dynamic'}
     if 'temperature' in effect.needs and span is None:
         return 'no temperature was recorded with all windows', 'record imu/temperature'
@@ -130,7 +117,13 @@ def _why_not(effect, have, table, kinds, span):
         return 'the recording has no motion', 'swing the table at several frequencies'
     if (effect.sensor, effect.contained_in) in have:
         return f'the {effect.contained_in} of the model contains it', f'omit {effect.contained_in} in the model'
-    return effect.moot(table) if effect.moot else None
+    if effect.moot and (why := effect.moot(table)):
+        return why
+    if 'cooling' in effect.needs and not turned:
+        return 'the temperature did not reverse: one branch only', f'record while it warms up and while it cools, by {TURN:g} K'
+    if 'vibration' in effect.needs and not shaken:
+        return 'it did not vibrate now more, now less at rest', f'record {SHAKEN_RESTS} rests and more while a machine on the table runs'
+    return None
 
 
 def time_constants(duration: float, number: int = N_TIME_CONSTANTS) -> np.ndarray:
@@ -173,7 +166,13 @@ LINEAR_STEPS = 25
 
 def linearise_again(model: SensorModel, solution: Solution) -> SensorModel | None:
     """Return the model linearised at a solution outside the validity of its linearisation, else None."""
-    return model.at(model.start_from(solution.model, _cautious(solution))) if _needs_another_pass(model, solution) else None
+    for effect in model.relinearised:
+        if effect.key in solution.model.slices:
+            part = solution.model.slices[effect.key]
+            moved = np.abs(solution.values[part] - model.point_of(effect))
+            if np.any(moved > np.maximum(3 * solution.sd[part], 5 * effect.step)):
+                return model.at(model.start_from(solution.model, _cautious(solution)))
+    return None
 
 
 def at_time_constants(model: SensorModel, effect: Effect, duration: float) -> list[SensorModel]:
@@ -202,15 +201,3 @@ def _cautious(solution):
     kept = values.copy()
     kept[moving] -= np.linalg.solve(known + np.diag(pull[moving]), pull[moving] * move[moving])
     return kept
-
-
-def _needs_another_pass(model, solution):
-    """Return whether an effect moved beyond the validity of its first derivative."""
-    for effect in model.relinearised:
-        if effect.key not in solution.model.slices:
-            continue
-        part = solution.model.slices[effect.key]
-        moved = np.abs(solution.values[part] - model.point_of(effect))
-        if np.any(moved > np.maximum(3 * solution.sd[part], 5 * effect.step)):
-            return True
-    return False

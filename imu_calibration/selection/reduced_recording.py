@@ -232,10 +232,7 @@ class ReducedRecording:
 
     def rebased(self, values: np.ndarray) -> 'ReducedRecording':
         """Return the same recording with the residual of other `values`; the point of linearisation is unchanged."""
-        moved = replace(self, values=values)
-        moved.__dict__.update({name: self.__dict__[name] for name in ('kind', 'moving', 'time', 'count', 'slow_rows', 'sessions')
-                               if name in self.__dict__})
-        return moved
+        return replace(self, values=values)
 
     def select(self, rows: np.ndarray) -> 'ReducedRecording':
         """Return the recording of the windows `rows` (mask) alone."""

@@ -107,7 +107,7 @@ def find_regimes(blocks: RestBlocks, problem: LinearisedProblem, used: Sequence[
     return found
 
 
-def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray, *, seed: int = 0) -> np.ndarray:
+def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray) -> np.ndarray:
     """
     Return random exchanges of the blocks' residuals: each window has the sequence of another of its kind and intensity of motion.
 
@@ -122,7 +122,6 @@ def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray, *, se
         Kind of that window.
     intensity : ndarray, shape (b,)
         Rate of rotation, rad/s.
-    seed : int, optional
 
     Returns
     -------
@@ -130,7 +129,7 @@ def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray, *, se
         Block of which each block has the residual.
 
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     _, starts, place, count = np.unique(window, return_index=True, return_inverse=True, return_counts=True)
     speed = np.sqrt(np.add.reduceat(intensity**2, starts) / count)
     partner = np.tile(np.arange(len(starts)), (PERMUTED, 1))

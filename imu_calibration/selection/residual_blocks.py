@@ -124,36 +124,37 @@ def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProb
     length = max(MIN_BLOCK_SECONDS, sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1) / MAX_RESIDUAL_BLOCKS)
     which = _some(windows, length)
     windows = [windows[k] for k in which]
-    parts = [_cut(window, length) for window in windows]
-    motion = JointMotion.joined([w.motion.select(part.rows) for w, part in zip(windows, parts)])
-    warm = all(w.temperature_c is not None for w in windows)
-    temperature = np.concatenate([part.of_rows(w.temperature_c) for w, part in zip(windows, parts)]) if warm else None
-    per_block = np.concatenate([part.per_block for part in parts])
-    place = np.repeat(np.arange(len(windows)), [len(part.per_block) for part in parts])
-    number = which[place]
-    count = np.concatenate([part.count for part in parts])
-    common = {'starts': np.cumsum(np.append(0, per_block[:-1])),
-              'time': np.concatenate([part.means(w.time) for w, part in zip(windows, parts)]),
-              'window': number, 'locked': problem.locked[number]}
+    starts_of, rows_of, per_block = zip(*(_cut(window, length) for window in windows))
+    motion = JointMotion.joined([window.motion.select(rows) for window, rows in zip(windows, rows_of)])
+    warm = [w.temperature_c[rows] if len(rows) > 1 else w.temperature_c.mean(keepdims=True) for w, rows in zip(windows, rows_of)
+            if w.temperature_c is not None]
+    temperature = np.concatenate(warm) if len(warm) == len(windows) else None
+    place = np.repeat(np.arange(len(windows)), [len(starts) for starts in starts_of])
+    edges = np.concatenate([starts + first for starts, first in zip(starts_of, np.cumsum([0, *map(len, windows[:-1])]))])
+    count = np.diff(edges, append=sum(map(len, windows))).astype(float)
+    common = {'starts': np.cumsum([0, *np.concatenate(per_block)[:-1]]),
+              'time': block_means(np.concatenate([window.time for window in windows]), edges),
+              'window': which[place], 'locked': problem.locked[which[place]]}
     references = References(problem.recording.model, table, motion, temperature_c=temperature)
     columns_of = _block_means(problem, table, motion, temperature, common['starts'])
-    found, edges = {}, np.concatenate([part.edges[:-1] + first for part, first in zip(parts, np.cumsum([0, *map(len, windows[:-1])]))])
     left = residuals(windows, table, problem.recording.model, values=problem.recording.values)
-    rough = {sensor: _roughness(residual, windows, edges, least=LEAST_NOISE[sensor]) for sensor, residual in left.items()}
+    inner = _inner(windows)
+    rough = {sensor: _roughness(residual, inner, edges, least=LEAST_NOISE[sensor]) for sensor, residual in left.items()}
     slope = {sensor: _slope(residual, windows, edges, sensor) for sensor, residual in left.items()}
-    freedom = _freedom(windows, edges)
+    freedom = np.add.reduceat(inner, edges) / PER_FREEDOM
     jitter = stamp_jitter(list(rough.values()), list(slope.values()), freedom)
     louder = {sensor: jitter_ratio(rough[sensor], slope[sensor], jitter.sd) for sensor in left}
-    of_kind = {str(kind): problem.recording.kind[number] == kind for kind in np.unique(problem.recording.kind[number]) if kind != 'static'}
+    kinds = problem.recording.kind[common['window']]
+    of_kind = {str(kind): kinds == kind for kind in np.unique(kinds) if kind != 'static'}
     jitter = replace(jitter, ratio={sensor: {kind: float(louder[sensor][own].mean()) for kind, own in of_kind.items()} for sensor in left})
+    found = {}
     for sensor, residual in left.items():
-        mean = np.add.reduceat(residual, edges, axis=0) / count[:, None]
         floor = explained.floor.noise[sensor]
         busier = _busier(windows, sensor, floor, problem.recording.kind[which], ~problem.locked[which])
         variance = floor.low_variance * busier[place] / count[:, None]
         # An estimated bias process would absorb a step or a warm-up; regimes are searched with the least bias processes.
         processes = natural_processes(floor, problem.recording.period)
-        rows = np.concatenate([columns_of[sensor], mean], axis=1)
+        rows = np.concatenate([columns_of[sensor], block_means(residual, edges)], axis=1)
         design = tuple(rows @ join for join in problem.space.join[sensor])
         found[sensor] = RestBlocks(sensor, references.at(sensor), **common, design=design, index=tuple(problem.space.index[sensor]),
                                    variance=variance, processes=processes, freedom=freedom,
@@ -161,9 +162,8 @@ def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProb
     return found
 
 
-def _roughness(residual, windows, edges, least):
+def _roughness(residual, inner, edges, least):
     """Return the variance by second differences in blocks that begin at the samples `edges`, at least rounding, shape (b, 3)."""
-    inner = _inner(windows)
     bends = np.diff(residual, 2, axis=0, prepend=residual[:1], append=residual[-1:])
     squares = np.add.reduceat(inner[:, None] * bends**2, edges, axis=0) / WHITE_BENDS
     return np.maximum(squares / np.maximum(np.add.reduceat(inner, edges), 1)[:, None], least**2)
@@ -176,11 +176,6 @@ def _inner(windows):
     return inner
 
 
-def _freedom(windows, edges):
-    """Return the degrees of freedom of `_roughness`, shape (b,)."""
-    return np.add.reduceat(_inner(windows), edges) / PER_FREEDOM
-
-
 def _slope(residual, windows, edges, sensor):
     """Return the mean square of the rate of change of the predicted output in blocks that begin at the samples `edges`, shape (b, 3)."""
     ends, squares = np.cumsum([0, *map(len, windows)]), np.zeros_like(residual)
@@ -188,7 +183,7 @@ def _slope(residual, windows, edges, sensor):
         if len(window) > 2:
             part = slice(first, first + len(window))
             squares[part] = np.gradient(measured(window, sensor) - residual[part], window.time, axis=0)**2
-    return np.add.reduceat(squares, edges, axis=0) / np.diff(np.append(edges, len(residual)))[:, None]
+    return block_means(squares, edges)
 
 
 def _some(windows, length):
@@ -245,32 +240,11 @@ def block_means(rows: np.ndarray, starts: np.ndarray) -> np.ndarray:
     return np.add.reduceat(rows, starts, axis=0) / counts.reshape(-1, *[1] * (rows.ndim - 1))
 
 
-@dataclass(frozen=True, eq=False)
-class _Cut:
-    """A window cut into blocks."""
-
-    edges: np.ndarray
-    """First sample of each block, and the number of samples."""
-    rows: np.ndarray
-    """Rows of the motion in use."""
-    per_block: np.ndarray
-    """Number of them in each block."""
-
-    @property
-    def count(self):
-        return np.diff(self.edges).astype(float)
-
-    def means(self, samples):
-        return np.add.reduceat(samples, self.edges[:-1], axis=0) / self.count.reshape(-1, *[1] * (samples.ndim - 1))
-
-    def of_rows(self, samples):
-        return samples[self.rows] if len(self.rows) > 1 else samples.mean(keepdims=True)
-
-
 def _cut(window, length):
-    size = len(window)
+    """Return the first sample of each block of a window, the rows of its motion in use, and the number of them in each block."""
     if len(window.motion) == 1:
-        return _Cut(np.array([0, size]), np.array([0]), np.array([1]))
-    edges = np.unique(np.linspace(0, size, max(1, round((window.time[-1] - window.time[0]) / length)) + 1).round().astype(int))
+        return np.array([0]), np.array([0]), np.array([1])
+    count = max(1, round((window.time[-1] - window.time[0]) / length))
+    edges = np.unique(np.linspace(0, len(window), count + 1).round().astype(int))
     rows = [np.unique((a + (np.arange(WITHIN) + 0.5) / WITHIN * (b - a)).astype(int)) for a, b in zip(edges, edges[1:])]
-    return _Cut(edges, np.concatenate(rows), np.array([len(part) for part in rows]))
+    return edges[:-1], np.concatenate(rows), np.array([len(part) for part in rows])

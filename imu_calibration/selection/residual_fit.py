@@ -67,17 +67,10 @@ class BlockFits:
         amplitudes, sds, rests = np.zeros((count, 3)), np.zeros((count, 3)), []
         for axis in range(3):
             at = np.union1d(self._at[axis], np.flatnonzero(np.isin(self.blocks.index[axis], list(more)))).astype(int)
-            chosen, locked = (self._rows(part, axis, at, columns) for part in (0, 1))
-            if half is not None:
-                time = self.blocks.time[~self.blocks.locked]
-                chosen = chosen[(time > np.median(time)) == half]
-            scale = np.sqrt(np.maximum((chosen[:, len(at):-1]**2).sum(axis=0), 1e-60))
-            own = self.blocks.index[axis][at]
-            sd, mean = np.append(self._prior[0][own], AMPLITUDE_PRIOR_SD / scale), np.append(self._prior[1][own], np.zeros(count))
-            values, covariance = solve_normal(chosen.T @ chosen, np.arange(len(sd)), sd, prior_mean=mean)
-            left = chosen[:, -1] - chosen[:, :-1] @ values
+            values, covariance, left = self._solved(axis, at, columns, half)
             misfit = max(float(left @ left) / max(len(left) - len(values), 1), 1.0)
             amplitudes[:, axis], sds[:, axis] = values[len(at):], np.sqrt(misfit * np.diag(covariance)[len(at):])
+            locked = self._rows(1, axis, at, columns)
             rests.append(locked[:, -1] - locked[:, :-1] @ values)
         return BlockFit(amplitudes, sds, np.stack(rests, axis=1), self.blocks.window[self.blocks.locked])
 
@@ -97,12 +90,21 @@ class BlockFits:
         """Return the sums of squares above the expectation from noise in the selection windows, shape (3,)."""
         excess = np.zeros(3)
         for axis in range(3):
-            rows = self._rows(0, axis, self._at[axis], None)
-            own = self.blocks.index[axis][self._at[axis]]
-            values, _ = solve_normal(rows.T @ rows, np.arange(len(own)), self._prior[0][own], prior_mean=self._prior[1][own])
-            left = rows[:, -1] - rows[:, :-1] @ values
+            left = self._solved(axis, self._at[axis])[2]
             excess[axis] = max(float(left @ left) - len(left), 0.0)
         return excess
+
+    def _solved(self, axis, at, columns=None, half=None):
+        """Return (values, covariance, residual) of a fit to the selection windows: of the parameters `at`, then of columns."""
+        rows = self._rows(0, axis, at, columns)
+        if half is not None:
+            time = self.blocks.time[~self.blocks.locked]
+            rows = rows[(time > np.median(time)) == half]
+        scale = np.sqrt(np.maximum((rows[:, len(at):-1]**2).sum(axis=0), 1e-60))
+        own = self.blocks.index[axis][at]
+        sd, mean = np.append(self._prior[0][own], AMPLITUDE_PRIOR_SD / scale), np.append(self._prior[1][own], np.zeros_like(scale))
+        values, covariance = solve_normal(rows.T @ rows, np.arange(len(sd)), sd, prior_mean=mean)
+        return values, covariance, rows[:, -1] - rows[:, :-1] @ values
 
     def _rows(self, part, axis, at, columns):
         design = self._design[part][axis]

@@ -71,7 +71,8 @@ def settle_rivals(problem: LinearisedProblem, chosen: Sequence[Question], linear
     near = [k for k in range(len(choices)) if k != best and costs[k] - costs[best] < TIE]
     settled, found = linearised_at(point=problem.point(same_questions(problem, choices[best]))), []
     for k in near:
-        taken, other = same_questions(settled, _difference(choices[best], choices[k]))
+        different = next(pair for pair in zip(choices[best], choices[k]) if pair[0].name != pair[1].name)
+        taken, other = same_questions(settled, different)
         moves = {name: values[k][name] - values[best][name] for name in problem.baseline.param_names}
         found.append(Rival(taken, other, float(costs[k] - costs[best]), moves))
     return settled, found
@@ -92,11 +93,6 @@ def _swapped(problem, chosen):
     return [[other if each is question else each for each in chosen] for question in chosen
             if question.effect.warp is not None and problem.curvature_shows(chosen, question) > MIN_CURVATURE_NATS
             for other, _ in problem.search.confounded(chosen, question, most=None) if other.effect.warp is not None]
-
-
-def _difference(one, two):
-    """Return the first pair of questions in which two choices differ."""
-    return next(pair for pair in zip(one, two) if pair[0].name != pair[1].name)
 
 
 def _cost(problem, chosen, judge):

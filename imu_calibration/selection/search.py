@@ -1,9 +1,8 @@
 """Choosing effects one after the other by held-out evidence, with earlier choices reconsidered after each step."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import AbstractSet
+from typing import AbstractSet, Any
 
 import numpy as np
 
@@ -86,6 +85,10 @@ class Search:
         self.evidence, self.baseline, self.questions = evidence, tuple(baseline), questions
         self.encoder_step, self.any_size, self.resolved = encoder_step, any_size, resolved
         self.history = []
+
+    def asking_any_size(self) -> 'Search':
+        """Return a search that allows sizes that are known of no instrument too."""
+        return Search(self.evidence, self.baseline, self.questions, encoder_step=self.encoder_step, any_size=True, resolved=self.resolved)
 
     def indices(self, chosen: Sequence[Question]) -> tuple[int, ...]:
         """Return the parameters of the baseline and of the chosen effects."""
@@ -249,23 +252,24 @@ def least_angle(effect: Effect, encoder_step: float) -> float:
     return 0.5 * encoder_step / angles[effect.unit] if effect.unit in angles else 0.0
 
 
-class SelectedEffects(ABC):
-    """PoseScan of a search, separated by plausibility of their sizes."""
+class SelectedEffects:
+    """Findings of a search, separated by plausibility of their sizes."""
 
+    problem: Any
     named: Sequence[Question]
 
     @property
-    @abstractmethod
     def search(self) -> Search:
         """On which they were chosen."""
+        return self.problem.search
 
     @property
     def implausible(self) -> list[Question]:
-        """PoseScan with sizes above those of any known instrument: reported, but added to a model only on request."""
+        """Findings with sizes above those of any known instrument: reported, but added to a model only on request."""
         return [question for question in self.named if self.search.implausible(self.named, question)]
 
     @property
     def adopted(self) -> list[Question]:
-        """PoseScan that belong into the model."""
+        """Findings that belong into the model."""
         strange = self.implausible
         return [question for question in self.named if question not in strange]

@@ -38,18 +38,18 @@ FEWEST_SAMPLES = 16
 
 @dataclass(frozen=True, eq=False)
 class Orders:
-    """Amplitudes of the orders of one joint in the three axes of a residual."""
+    """Amplitudes of the orders of one joint in the columns of a residual."""
 
     order: np.ndarray
     """Cycles per turn, shape (k,)."""
     amplitude: np.ndarray
-    """Of the wave that keeps its phase, in the unit of the rest, shape (k, 3)."""
+    """Of the wave that keeps its phase, in the unit of the rest, shape (k, m)."""
     p_value: np.ndarray
-    """Probability by noise, with a random phase in every piece; shape (k, 3)."""
+    """Probability by noise, with a random phase in every piece; shape (k, m)."""
     power: np.ndarray
-    """Squared amplitude over the median of all orders, shape (k, 3)."""
+    """Squared amplitude over the median of all orders, shape (k, m)."""
     share: np.ndarray
-    """Share of the windows with a phase within 60 degrees of it, shape (k, 3)."""
+    """Share of the windows with a phase within 60 degrees of it, shape (k, m)."""
 
 
 def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int) -> Orders | None:
@@ -64,7 +64,7 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     ----------
     windows : sequence of Window
     rests : sequence of ndarray
-        Rest of each window, shape (n, 3).
+        Rest of each window, shape (n, m).
     joint : int
 
     """
@@ -72,14 +72,14 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     pieces = [(number, *_projected(rest, time, angle, order)) for number, rest, time, angle in _pieces(windows, rests, joint)]
     if not pieces:
         return None
-    number, sums, weight = (np.stack(part) for part in zip(*pieces))   # (p,), (p, k, 3), (p, k)
+    number, sums, weight = (np.stack(part) for part in zip(*pieces))   # (p,), (p, k, m), (p, k)
     seen = weight > 0
     enough = seen.sum(axis=0) >= MIN_SPECTRUM_PIECES
     if not enough.any():
         return None
     order, sums, weight, count = order[enough], sums[:, enough], weight[:, enough], seen.sum(axis=0)[enough]
     scaled = sums / np.sqrt(np.where(weight > 0, weight, np.inf))[..., None]
-    parts = np.stack([scaled.real, scaled.imag], axis=-1)   # (p, k, 3, 2)
+    parts = np.stack([scaled.real, scaled.imag], axis=-1)   # (p, k, m, 2)
     mean = parts.sum(axis=0) / count[:, None, None]
     about = np.einsum('pkxi,pkxj->kxij', parts, parts) - count[:, None, None, None] * np.einsum('kxi,kxj->kxij', mean, mean)
     scatter = about / (count - 1)[:, None, None, None]
@@ -119,10 +119,10 @@ def _pieces(windows, rests, joint) -> Iterator[tuple[int, np.ndarray, np.ndarray
 
 
 def _projected(rest, time, angle, order):
-    """Return (sum of the rest against each order, shape (k, 3), weight, shape (k,)); zero where a piece does not show an order."""
+    """Return (sum of the rest against each order, shape (k, m), weight, shape (k,)); zero where a piece does not show an order."""
     turned = np.ptp(angle)
     shown = (turned * order > 2 * np.pi * CYCLES_OF_ORDER) & (2 * np.pi > SHORTEST_CYCLE * order * np.abs(np.diff(angle)).max())
-    sums, weight = np.zeros((len(order), 3), complex), np.zeros(len(order))
+    sums, weight = np.zeros((len(order), rest.shape[1]), complex), np.zeros(len(order))
     if shown.any():
         middle = (angle - angle.mean()) / turned
         smooth = np.linalg.qr(np.column_stack([np.ones(len(time)), time - time.mean(), middle, middle**2]))[0]
@@ -208,20 +208,21 @@ def find_tones(found: Investigation, table: Table, formulas: Sequence[Proposal] 
             known = replace(model, catalogue=model.catalogue.with_effects(effect))
             model, values = known.with_sized_effect(values, effect.sensor, effect.name, size=size)
     left = residuals(found.used, table, model, values=values)
-    edges = np.cumsum([len(window) for window in found.used])[:-1]
+    edges, tests = np.cumsum([len(window) for window in found.used])[:-1], 1 + len(table.joint_names)
+    parts = {sensor: np.split(rest, edges) for sensor, rest in left.items()}
     tones = {}
-    for sensor in SENSORS:
-        parts = np.split(left[sensor], edges)
-        fixed = _significant(of_stretches(sensor, _stretches(found.used, parts, None), None), 1 + len(table.joint_names))
-        for tone in fixed.values():   # sampled at equal angles, a fixed frequency would be a multiple of some speeds
-            for window, part in zip(found.used, parts):
+    for sensor, own in parts.items():
+        tones[sensor] = _significant(of_stretches(sensor, _stretches(found.used, own, None), None), tests)
+        for tone in tones[sensor].values():   # sampled at equal angles, a fixed frequency would be a multiple of some speeds
+            for window, part in zip(found.used, own):
                 part[:, AXES.index(tone.axis)] = _without(tone.frequency, window.time, part[:, AXES.index(tone.axis)])
+    both = [np.concatenate(pair, axis=1) for pair in zip(*parts.values())]
+    orders = [orders_of(found.used, both, joint) for joint in range(len(table.joint_names))]
+    for sensor, own in parts.items():
         turning = (tone for joint, name in enumerate(table.joint_names)
-                   for tone in (*of_stretches(sensor, _stretches(found.used, parts, joint), name),
-                                *_whole(sensor, found.used, parts, joint, name)))
-        every = fixed | _significant(turning, 1 + len(table.joint_names))
-        tones[sensor] = tuple(sorted(every.values(), key=lambda tone: tone.p_value))
-    return tones
+                   for tone in (*of_stretches(sensor, _stretches(found.used, own, joint), name), *_whole(sensor, orders[joint], name)))
+        tones[sensor] |= _significant(turning, tests)
+    return {sensor: tuple(sorted(every.values(), key=lambda tone: tone.p_value)) for sensor, every in tones.items()}
 
 
 def _significant(tones, tests):
@@ -239,18 +240,18 @@ def _without(frequency, time, values):
     return values - basis @ (basis.T @ values)
 
 
-def _whole(sensor, windows, parts, joint, name) -> Iterator[Tone]:
-    """Yield the most significant Tone of each axis with a constant phase on a joint, if any."""
-    orders = None if joint is None else orders_of(windows, parts, joint)
+def _whole(sensor, orders, joint) -> Iterator[Tone]:
+    """Yield the most significant Tone of each axis with a constant phase on a joint, if any, from the orders of both sensors."""
     if orders is None:
         return
     for axis in range(3):
-        out = (orders.power[:, axis] > OUT) & (orders.share[:, axis] > MIN_ORDER_SHARE)
+        column = 3 * SENSORS.index(sensor) + axis
+        out = (orders.power[:, column] > OUT) & (orders.share[:, column] > MIN_ORDER_SHARE)
         if out.any():
-            best = int(np.argmin(np.where(out, orders.p_value[:, axis], np.inf)))
-            yield Tone(sensor, AXES[axis], name, float(orders.order[best]), float(orders.amplitude[best, axis]),
-                       float(orders.p_value[best, axis] * len(orders.order)), float(orders.share[best, axis]), orders.order,
-                       orders.power[:, axis])
+            best = int(np.argmin(np.where(out, orders.p_value[:, column], np.inf)))
+            yield Tone(sensor, AXES[axis], joint, float(orders.order[best]), float(orders.amplitude[best, column]),
+                       float(orders.p_value[best, column] * len(orders.order)), float(orders.share[best, column]), orders.order,
+                       orders.power[:, column])
 
 
 def _stretches(windows: Sequence[Window], parts: Sequence[np.ndarray], joint: int | None) -> Iterator[tuple[np.ndarray, float, float]]:
@@ -260,20 +261,16 @@ def _stretches(windows: Sequence[Window], parts: Sequence[np.ndarray], joint: in
         if joint is None:
             # Samples that are missing are few: a tone keeps its frequency but for the stretch that they are in.
             yield from ((piece, step, MAX_FREQUENCY_SHARE / step) for piece in _cut(rest, round(1 / (FREQUENCY_STEP * step))))
-        elif _keeps_turning(window.motion.rate[:, joint]):
+        elif (rate := window.motion.rate[:, joint]).min() > MIN_ORDER_RATE or rate.max() < -MIN_ORDER_RATE:
             turns = window.motion.position[:, joint] / (2 * np.pi)
             order = slice(None, None, int(np.sign(turns[-1] - turns[0])))
             even = np.arange(turns[order][0], turns[order][-1], 1 / ANGLES_PER_TURN)
             if len(even) < FEWEST_SAMPLES:
                 continue
             taken = np.stack([np.interp(even, turns[order], axis[order]) for axis in rest.T], axis=1)
-            fastest = float(np.abs(window.motion.rate[:, joint]).max()) * step / (2 * np.pi)
+            fastest = float(np.abs(rate).max()) * step / (2 * np.pi)
             highest = min(MAX_FREQUENCY_SHARE / fastest, MAX_FREQUENCY_SHARE * ANGLES_PER_TURN)
             yield from ((piece, 1 / ANGLES_PER_TURN, highest) for piece in _cut(taken, round(ANGLES_PER_TURN / FREQUENCY_STEP)))
-
-
-def _keeps_turning(rate):
-    return rate.min() > MIN_ORDER_RATE or rate.max() < -MIN_ORDER_RATE
 
 
 def _cut(rest, longest):

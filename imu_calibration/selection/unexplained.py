@@ -183,11 +183,7 @@ def slow_explanations(time: np.ndarray, temperature: np.ndarray) -> Iterator[tup
     every = np.ones(len(time), bool)
     time = (time - time.mean()) / max(np.ptp(time), 1e-9)
     yield 'time', np.stack([time, time**2, time**3], axis=1), every
-    yield 'time', _step(time), every
+    yield 'time', np.stack([time > level for level in np.quantile(time, (0.2, 0.35, 0.5, 0.65, 0.8))], axis=1).astype(float), every
     if np.all(np.isfinite(temperature)) and np.ptp(temperature) > 0.5:
         warm = (temperature - temperature.mean()) / np.ptp(temperature)
         yield 'temperature', np.stack([warm, warm**2], axis=1), every
-
-
-def _step(time):
-    return np.stack([time > level for level in np.quantile(time, (0.2, 0.35, 0.5, 0.65, 0.8))], axis=1).astype(float)

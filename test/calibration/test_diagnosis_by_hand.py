@@ -141,7 +141,7 @@ def test_the_gain_is_the_error_of_corrected_readings_in_held_out_poses(respondin
             squares[side] += np.sum((rate - earth * force / np.linalg.norm(force, axis=1)[:, None])**2)
     assert (gain.of, gain.measure, gain.windows) == (APPLIED, 'poses', len(poses.start))
     assert_allclose([gain.heldout_rms_before, gain.heldout_rms_after], np.sqrt(np.array(squares) / poses.rate.size), rtol=1e-7)
-    of_model = found.gain([], found.named, 'gyroscope')
+    of_model = found.problem.gain(found.held_out, [], found.named, sensor='gyroscope')
     assert of_model.of == OF_MODEL and abs(gain.heldout_rms_before / of_model.heldout_rms_before - 1) > 1e-3
 
 

@@ -211,7 +211,7 @@ HAND = _of(
      'test_diagnosis_by_hand.py::test_a_place_among_few_poses_is_paid_for'),
     ('a hysteresis is asked where it warms up only', 'BRANCHES_APART', '...', '0.0',
      'test_thermal_branch.py::test_it_is_asked_only_where_the_temperature_turned'),
-    ('a rectification is asked where nothing vibrates', '_not_shaken', "'vibration' in _1.needs and (not _2)", 'False',
+    ('a rectification is asked where nothing vibrates', '_why_not', "'vibration' in _1.needs and (not _2)", 'False',
      'test_vibration.py::test_it_is_asked_only_where_rests_vibrate_unlike'),
     ('a hand passes for vibration', 'quiet_beside_joints', '_1 & _steady(_2, _3, _4, ratio=_5, resting=_6)',
      '_steady(_2, _3, _4, ratio=_5, resting=_6)',

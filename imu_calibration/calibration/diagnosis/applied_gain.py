@@ -84,8 +84,8 @@ def gain_by_hand(found: HandInvestigation, before: Sequence[Question], *, after:
     """
     applied = _compensated(found, before, after)
     if applied is None:
-        return found.gain(before, after, sensor)
-    block, poses = found.clearest(applied[0], applied[1], sensor), found.baseline.poses
+        return found.problem.gain(found.held_out, before, after, sensor=sensor)
+    block, poses = found.problem.clearest(applied[0], applied[1], sensor), found.baseline.poses
     end = end_by_hand(poses)
     pair = [np.zeros((len(block.pose), 1 if block.duration is not None else block.known.shape[1])) for _ in applied]
     start = 0.0

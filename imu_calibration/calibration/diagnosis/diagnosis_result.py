@@ -77,7 +77,7 @@ class Diagnosis:
     """Result of a diagnosis for reports, documents and nodes."""
 
     findings: tuple
-    """PoseScan in order of strength."""
+    """Findings in order of strength."""
     unexplained: dict
     """Sensor -> `unexplained.Unexplained`, in addition to the findings."""
     candidates: tuple

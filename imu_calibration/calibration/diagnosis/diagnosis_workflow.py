@@ -47,7 +47,7 @@ class DiagnosisResult:
     """A diagnosis with the content of its files and its report."""
 
     diagnosis: Diagnosis
-    """PoseScan, candidates and unexplained residuals."""
+    """Findings, candidates and unexplained residuals."""
     calibration: Calibration
     """The extended calibration; that of the baseline without findings."""
     tolerances: np.ndarray

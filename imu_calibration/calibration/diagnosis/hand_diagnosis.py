@@ -14,22 +14,15 @@ from imu_calibration.references.gravity.model_selection import HandInvestigation
 
 def _with_residuals(hand):
     """Return the HandCalibration with the rms residual of its poses."""
-    residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': _rates_left(hand)}
+    residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': hand.rate_rows()[0]}
     return replace(hand, residual_rms={sensor: np.full(2, np.sqrt(np.mean(residual**2))) for sensor, residual in residuals.items()})
-
-
-def _rates_left(hand):
-    """Return the residual rates at rest, shape (k, 3)."""
-    poses, true = hand.poses, hand.gravity * hand.state.up
-    more = hand.hand_model.further('gyroscope', hand.values, true, **poses.conditions)[0]
-    return poses.rate - hand.gyroscope[0] - more
 
 
 def traces_of(baseline: HandCalibration, hand: HandCalibration) -> Traces:
     """Return the `Traces` of two calibrations: one point per pose, the accelerometer's residual along gravity."""
     poses = hand.poses
     true = hand.gravity * hand.state.up
-    errors = [{'accelerometer': h.norm_residuals()[:, None] * h.state.up, 'gyroscope': _rates_left(h)} for h in (baseline, hand)]
+    errors = [{'accelerometer': h.norm_residuals()[:, None] * h.state.up, 'gyroscope': h.rate_rows()[0]} for h in (baseline, hand)]
     count = len(poses.start)
     return Traces(poses.time, np.full(count, 'static'), np.zeros((count, 0)), true, np.zeros((count, 3)), poses.temperature_c, errors[0],
                   errors[1], (poses.stop - poses.start).astype(float), None)

@@ -1,4 +1,4 @@
-"""PoseScan as sentences, and motions that separate effects."""
+"""Findings as sentences, and motions that separate effects."""
 
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
@@ -20,7 +20,7 @@ MIN_EVIDENCE_GROWTH = 9.0
 """Least growth of the evidence that a motion must promise, in squared standard deviations."""
 
 
-def separating_motion(solution: Solution, question: Question, mate: Question, *, gravity: float) -> Any:
+def separating_motion(solution: Solution, question: Question, mate: Question, *, gravity: float) -> str:
     """
     Return the standard motion after which the mate could no longer pass for the effect that was found.
 
@@ -35,18 +35,26 @@ def separating_motion(solution: Solution, question: Question, mate: Question, *,
         The finding and an effect that would do as well.
 
     """
-    if question.sensor in SENSORS and mate.sensor in SENSORS and question.effect.groups and mate.effect.groups:
-        text = _best_motion(solution, question, mate, gravity)
-        if text is not None:
-            return text
-    return motions_of(question, mate)
+    best = MIN_EVIDENCE_GROWTH, motions_of(question, mate)
+    if not all(each.sensor in SENSORS and each.effect.groups for each in (question, mate)):
+        return best[1]
+    model = solution.model.with_effect(mate.sensor, mate.name)
+    values = model.start_from(solution.model, solution.values)
+    values = np.where(np.isfinite(values), values, 0.0)
+    prior_sd = np.where(model.prior()[1] > 0, model.prior()[1], 1.0)
+    own = model.slices[question.sensor, question.name]
+    for motion in MOTIONS:
+        total = np.diag(1 / prior_sd**2) + added_information(model, values, solution.noise, motion=motion, gravity=gravity)
+        left = float(values[own] @ np.linalg.solve(inverse_normal(total)[own, own], values[own]))
+        if left > best[0]:
+            best = left, motion.text
+    return best[1]
 
 
 def motions_of(question: Question, mate: Question) -> str:
     """Return the motions that two effects declare as theirs."""
-    own = [name for name in question.effect.motion + mate.effect.motion]
     texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
-    return '; '.join(dict.fromkeys(texts[name] for name in own if name in texts))
+    return '; '.join(dict.fromkeys(texts[name] for name in question.effect.motion + mate.effect.motion if name in texts))
 
 
 def motions_of_one_joint(question: Question, mate: Question) -> str:
@@ -54,21 +62,6 @@ def motions_of_one_joint(question: Question, mate: Question) -> str:
     own = dict.fromkeys(question.effect.motion + mate.effect.motion)
     found = [ONE_JOINT[name] for name in own if name in ONE_JOINT]
     return '; '.join(found + [OTHER_MOUNT] * (len(found) < len(own)))
-
-
-def _best_motion(solution, question, mate, gravity):
-    model = solution.model.with_effect(mate.sensor, mate.name)
-    values = model.start_from(solution.model, solution.values)
-    values = np.where(np.isfinite(values), values, 0.0)
-    prior_sd = np.where(model.prior()[1] > 0, model.prior()[1], 1.0)
-    own = model.slices[question.sensor, question.name]
-    best = (MIN_EVIDENCE_GROWTH, None)
-    for motion in MOTIONS:
-        total = np.diag(1 / prior_sd**2) + added_information(model, values, solution.noise, motion=motion, gravity=gravity)
-        left = float(values[own] @ np.linalg.solve(inverse_normal(total)[own, own], values[own]))
-        if left > best[0]:
-            best = (left, motion.text)
-    return best[1]
 
 
 LEAVES_MOST = 'rejected: most of the residual would remain'
@@ -154,7 +147,7 @@ def verdict_of(name: str, alone: Score, beside: Score | None, *, found: Collecti
     alone, beside : Score
         Evidence on top of the baseline, and on top of the findings (None for a finding).
     found : set of str
-        PoseScan.
+        Findings.
     mates : dict
         Effects that would do as well -> finding.
 
@@ -198,6 +191,9 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
 
     """
     question = named[place]
+
+    def in_its_place(mate):
+        return fitted(search, [*named[:place], mate, *named[place + 1:]], mate)
     score = search.score([q for q in named if q is not question], question)
     gain, explained = gain_of(place), share(named, question)
     if question.effect.key in solution.model.slices:
@@ -212,13 +208,8 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
     return Finding(question.name, question.sensor, text, parameters, score.p_value, score.gain, explained, gain,
                    tuple(mate.name for mate in mates),
                    motion_of(question, mates[0]) if mates else '', question.effect.against,
-                   {mate.name: _in_its_place(search, named, place, mate) for mate in mates}, score.implausible)
-
-
-def _in_its_place(search, named, place, mate):
-    """Return parameter name -> (value, unit) of an effect that replaces a finding."""
-    found = fitted(search, [*named[:place], mate, *named[place + 1:]], mate)
-    return {name: (value, unit) for name, (value, _, unit) in found.items()}
+                   {mate.name: {name: (value, unit) for name, (value, _, unit) in in_its_place(mate).items()} for mate in mates},
+                   score.implausible)
 
 
 def fitted(search: Search, named: Sequence[Question], question: Question) -> dict[str, tuple[float, float, str]]:

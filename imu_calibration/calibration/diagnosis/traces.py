@@ -13,8 +13,8 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.strapdown import dead_reckoning_errors
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import StoredWindows, Window, all_samples, chunks
-from imu_calibration.selection.gain import MEASURES, OF_MODEL, Gain, reduction_interval
-from imu_calibration.selection.residual_blocks import residuals
+from imu_calibration.selection.gain import MEASURES, OF_MODEL, Gain, gain_of
+from imu_calibration.selection.residual_blocks import block_means, residuals
 from imu_calibration.selection.saturation import measured
 from imu_calibration.simulation.session import predict_windows
 
@@ -133,8 +133,7 @@ class DistanceSums:
         pairs = ([(within + n * mean, 3 * n) for within, mean in models], [(mean, 0 * n + 3) for _, mean in models],
                  [(within, 3 * (n - 1)) for within, _ in models], [(mean[still], 3 + 0 * mean[still]) for _, mean in models])
         for measure, pair in zip(MEASURES, pairs):
-            rms = [float(np.sqrt(total.sum() / max(number.sum(), 1))) for total, number in pair]
-            found[measure] = Gain(sensor, measure, rms[0], rms[1], reduction_interval(pair), len(pair[0][0]), of)
+            found[measure] = gain_of(sensor, measure, pair, of=of)
         return found
 
 
@@ -216,11 +215,11 @@ def residual_traces(windows: Sequence[Window] | StoredWindows, table: Table, bef
         for window, stop in zip(group, ends):
             rows = slice(stop - len(window), stop)
             sums.add(window, [{sensor: own[rows] for sensor, own in each.items()} for each in (rest[0], rest[-1])], before.noise)
-        block, number, n_blocks = _blocks(group)
+        starts = _starts(group)
         values = [np.concatenate([w.time for w in group]), *against[:3], *(each[s] for each in (rest[0], rest[-1]) for s in SENSORS)]
-        parts.append([_block_mean(value, block, number) for value in values])
-        warmth.append(None if against[3] is None else _block_mean(against[3], block, number))
-        counts.append((number, np.repeat([str(w.kind) for w in group], n_blocks)))
+        parts.append([block_means(value, starts) for value in values])
+        warmth.append(None if against[3] is None else block_means(against[3], starts))
+        counts.append((np.diff(starts, append=ends[-1]), np.repeat([str(w.kind) for w in group], [len(w) for w in group])[starts]))
     known = [each for each in warmth if each is not None]
     temperature = np.concatenate(known) if len(known) == len(warmth) else None
     time, position, force_s, rate_s, *errors = (np.concatenate(column) for column in zip(*parts))
@@ -273,18 +272,10 @@ def _references(model, table, motion, temperature):
     return {s: warped_reference(model.model.at(model.values), s, table, motion=motion, temperature_c=temperature) for s in SENSORS}
 
 
-def _blocks(windows):
-    """Return the block of each sample, the number of samples of each block and of blocks of each window; blocks end with their window."""
-    places = [np.unique(((window.time - window.time[0]) / PLOT_BLOCK_SECONDS).astype(int), return_inverse=True)[1] for window in windows]
-    n_blocks = [int(place[-1]) + 1 for place in places]
-    block = np.concatenate([start + place for start, place in zip(np.cumsum([0, *n_blocks]), places)])
-    return block, np.bincount(block), n_blocks
-
-
-def _block_mean(values, block, number):
-    columns = values.reshape(len(values), -1)
-    means = np.stack([np.bincount(block, column, len(number)) / number for column in columns.T], axis=1)
-    return means[:, 0] if values.ndim == 1 else means
+def _starts(windows):
+    """Return the first sample of each block of the windows in one piece; blocks end with their window."""
+    places = [((window.time - window.time[0]) / PLOT_BLOCK_SECONDS).astype(int) for window in windows]
+    return np.flatnonzero(np.concatenate([np.diff(place, prepend=-1) for place in places]))
 
 
 def _dead_reckoning(windows, spans, table, models):

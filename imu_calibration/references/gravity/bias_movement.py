@@ -39,8 +39,7 @@ def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[s
     time = (poses.time - poses.time.mean()) / np.ptp(poses.time)
     residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
     true = model.compensate(values, poses.force, np.zeros_like(poses.force), **poses.conditions)[0]
-    more = model.further('gyroscope', values, true, **poses.conditions)[0]
-    turning = (poses.rate - values[model.gyro_bias] - more)
+    turning = model.rate_rows(values, true, poses.rate, **poses.conditions)[0]
     base = columns[:, model.base_index('accelerometer')]
     found = {'accelerometer': _of_norms(time, residual, base), 'gyroscope': _of_rates(time, turning)}
     return {sensor: movement for sensor, movement in found.items() if movement is not None}
@@ -57,7 +56,7 @@ def _of_norms(time, residual, base):
     back = base[:, 0:3]
     powers = _powers(time, len(time) - base.shape[1] - 3)
     added = np.hstack([power[:, None] * back for power in powers.T])
-    known, new = _orthonormal(base), _orthonormal(np.hstack([base, added]))
+    known, new = orthonormal_basis(base), orthonormal_basis(np.hstack([base, added]))
     spare = len(time) - new.shape[1]
     if spare < MIN_DRIFT_FREEDOM or not _shown(*(np.sum((residual - basis @ (basis.T @ residual))**2) for basis in (known, new)),
                                                new.shape[1] - known.shape[1], spare):
@@ -81,9 +80,14 @@ def _of_rates(time, rates):
     return BiasMovement(course, np.ones(12))
 
 
-def _orthonormal(columns):
-    left, singular, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
-    return left[:, singular > 1e-6 * singular[0]]
+def orthonormal_basis(columns: np.ndarray, least: float = 1e-6) -> np.ndarray:
+    """Return an orthonormal basis of columns of unit length, maybe dependent: singular values above `least` of the largest count."""
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns[:, size > 0] / size[size > 0]
+    if not columns.shape[1]:
+        return columns
+    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, singular > least * singular[0]]
 
 
 def _shown(before, after, added, spare):

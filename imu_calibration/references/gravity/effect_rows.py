@@ -47,10 +47,8 @@ class Block:
 class HandSpace:
     """Parameters of a diagnosis by hand: baseline, Earth's rate about the vertical, then one run per column set."""
 
-    names: tuple
-    """Label of each run of columns: effect name, for a warm-up with the number of its time constant."""
     parts: dict
-    """Label -> slice."""
+    """Label of each run of columns (effect name, for a warm-up with the number of its time constant) -> slice."""
     prior_sd: np.ndarray
     """Shape (q,); wide for the baseline, which is linearised at its own solution."""
     size: int
@@ -81,15 +79,14 @@ def build_rows(hand: HandCalibration, turns: Sequence[TurnData], effects: Sequen
     ends = np.cumsum([base + 1] + sizes)
     widths = np.concatenate([1e3 * hand.hand_model.priors, [EARTH_UPWARDS_SD], *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes))])
     parts = {label: slice(a, b) for (_, label, _), a, b in zip(sets, ends, ends[1:])}
-    space = HandSpace(tuple(parts), parts, widths, int(ends[-1]))
-    at_rest = {label: _columns(hand, effect, tau, hand.gravity * hand.state.up, np.zeros_like(hand.state.up), hand.poses.time,
-                               hand.poses.temperature_c)[:, :, :space.parts[label].stop - space.parts[label].start] for effect, label,
-               tau in sets}
-    sensor_of = {label: effect.sensor for effect, label, _ in sets}
-    moving = [effect for effect, label, tau in sets if effect.sensor == 'gyroscope' and tau is None]
-    blocks = [_norm_block(hand, space, at_rest, sensor_of), _rest_block(hand, space, at_rest, sensor_of)]
+    space = HandSpace(parts, widths, int(ends[-1]))
+    true, zero = hand.gravity * hand.state.up, np.zeros_like(hand.state.up)
+    at_rest = {sensor: {label: _columns(hand, effect, tau, true, zero, hand.poses.time, hand.poses.temperature_c)[:, :, :size]
+                        for (effect, label, tau), size in zip(sets, sizes) if effect.sensor == sensor} for sensor in SENSORS}
+    blocks = [_norm_block(hand, space, at_rest['accelerometer']), _rest_block(hand, space, at_rest['gyroscope'])]
     if between := gravity_turns(turns):
-        blocks.append(_turn_block(hand, between, space, at_rest, moving))
+        moving = [effect for effect, _, tau in sets if effect.sensor == 'gyroscope' and tau is None]
+        blocks.append(_turn_block(hand, between, space, at_rest['gyroscope'], moving))
     return blocks, space
 
 
@@ -112,7 +109,7 @@ def _natural(poses, sensor):
     return NATURAL**2 * poses.noise[sensor].white_variance * poses.period
 
 
-def _norm_block(hand, space, at_rest, sensor_of):
+def _norm_block(hand, space, at_rest):
     """One row per pose: ``|true force| - gravity``."""
     poses, count = hand.poses, len(hand.poses.start)
     residual, base = hand.hand_model.norm_rows(hand.values, poses.force, **poses.conditions)
@@ -120,26 +117,20 @@ def _norm_block(hand, space, at_rest, sensor_of):
     rows = np.zeros((count, space.size + 1))
     rows[:, :base.shape[1]], rows[:, -1] = base, residual
     for label, columns in at_rest.items():
-        if sensor_of[label] == 'accelerometer':
-            rows[:, space.parts[label]] = np.einsum('ki,kip->kp', back, columns)
+        rows[:, space.parts[label]] = np.einsum('ki,kip->kp', back, columns)
     known = np.sum((back * poses.force_sem)**2, axis=1)
     floor = known + back**2 @ _natural(poses, 'accelerometer')
     return Block('poses', 'accelerometer', rows[:, None], known[:, None], floor[:, None], np.arange(count), poses.time)
 
 
-def _rest_block(hand, space, at_rest, sensor_of):
+def _rest_block(hand, space, at_rest):
     """Three rows per pose: the rate at rest, with the Earth's rate about the vertical."""
     poses, count = hand.poses, len(hand.poses.start)
-    true = hand.gravity * hand.state.up
-    more, slopes = hand.hand_model.further('gyroscope', hand.values, true, **poses.conditions)
+    residual, base = hand.rate_rows()
     rows = np.zeros((count, 3, space.size + 1))
-    rows[:, :, hand.hand_model.gyro_bias] = np.eye(3)
-    rows[:, :, hand.hand_model.size] = hand.state.up
-    rows[:, :, hand.hand_model.extra_index('gyroscope')] = slopes
-    rows[:, :, -1] = poses.rate - hand.gyroscope[0] - more
+    rows[:, :, :base.shape[2]], rows[:, :, base.shape[2]], rows[:, :, -1] = base, hand.state.up, residual
     for label, columns in at_rest.items():
-        if sensor_of[label] == 'gyroscope':
-            rows[:, :, space.parts[label]] = columns
+        rows[:, :, space.parts[label]] = columns
     known = poses.rate_sem**2
     floor = known + _natural(poses, 'gyroscope')
     return Block('poses', 'gyroscope', rows, known, floor, np.arange(count), poses.time)

@@ -152,11 +152,8 @@ def _pose_rows(model, state, poses, across):
 
 def _drift_rows(model, state, poses):
     """``rate = bias + further effects (gravity * up) + drift`` at rest."""
-    more, slopes = model.further('gyroscope', state.values, model.gravity * state.up, **poses.conditions)
-    main = np.zeros((len(slopes), 3, model.size))
-    main[:, :, model.gyro_bias] = np.eye(3)
-    main[:, :, model.extra_index('gyroscope')] = slopes
-    return _flat(poses.rate - state.values[model.gyro_bias] - more - state.drift, OF_DRIFT, np.eye(3), main, poses.rate_sem**2, -1)
+    rate, main = model.rate_rows(state.values, model.gravity * state.up, poses.rate, **poses.conditions)
+    return _flat(rate - state.drift, OF_DRIFT, np.eye(3), main, poses.rate_sem**2, -1)
 
 
 def _calm_rows(model, state, poses):

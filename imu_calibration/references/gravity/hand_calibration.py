@@ -15,7 +15,7 @@ from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, total, w
 from imu_calibration.estimation.solution import Solution, Status, statuses, tolerances_of
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import bias_movements, with_movement, without_movement
-from imu_calibration.references.gravity.equations import COMPONENTS, SCATTER_SD, Poses, State
+from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_options import HandOptions, KnownTurn
 from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandModel
@@ -105,6 +105,10 @@ class HandCalibration(Solution):
         poses = self.poses
         return self.hand_model.norm_rows(self.values, poses.force, **poses.conditions)[0]
 
+    def rate_rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the residual rates of the poses, shape (k, 3), and their columns, shape (k, 3, n)."""
+        return self.hand_model.rate_rows(self.values, self.gravity * self.state.up, self.poses.rate, **self.poses.conditions)
+
 
 def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), stills: Sequence | None = None, *,
                       known_turns: Sequence[KnownTurn] = (), temperature_c: np.ndarray | None = None) -> HandCalibration:
@@ -190,7 +194,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     model = replace(model, gyro_factor=full_scale_factor(state, poses, turns))
     turns, contradicted = possible_turns(model, state, poses, turns=turns)
     left = {'contradicted by gravity': contradicted} if contradicted else {}
-    solved = partial(solve_joint, gravity_sd=options.gravity_sd, fallback=np.square(SCATTER_SD))
+    solved = partial(solve_joint, gravity_sd=options.gravity_sd)
     for effect in model.extras:
         if effect.time_constant and effect.name not in (point or {}):   # a time constant far from the prior does not converge from there
             trials = [replace(model, model=each) for each in at_time_constants(model.model, effect, float(poses.time[-1]))]

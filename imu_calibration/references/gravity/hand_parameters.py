@@ -182,6 +182,15 @@ class HandModel:
         columns[:, self.extra_index('accelerometer')] = np.einsum('ki,kip->kp', back, slopes)
         return norm - self.gravity, columns
 
+    def rate_rows(self, values: np.ndarray, force: np.ndarray, rate: np.ndarray, *, time: np.ndarray | None = None,
+                  temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``rate - bias - further effects`` of mean rates at rest, (k, 3), and its columns, (k, 3, n), at true specific forces."""
+        more, slopes = self.further('gyroscope', values, force, time=time, temperature_c=temperature_c)
+        columns = np.zeros((len(rate), 3, self.size))
+        columns[:, :, self.gyro_bias] = np.eye(3)
+        columns[:, :, self.extra_index('gyroscope')] = slopes
+        return rate - values[self.gyro_bias] - more, columns
+
 
 def _reference(force, rate, time, temperature_c, gravity):
     time = np.zeros(len(force)) if time is None else np.asarray(time, float)

@@ -65,7 +65,7 @@ class HandProblem:
         """
         named = list(pruned(self.search.run(), self.explained.share))
         if self.explained.rest(named):
-            wide = Search(self.evidence, self.search.baseline, self.questions, any_size=True)
+            wide = self.search.asking_any_size()
             known, self.search = self.search, wide
             others = list(pruned(wide.run(), self.explained.share))
             if self.explained.rest(others) < self.explained.rest(named):
@@ -87,6 +87,24 @@ class HandProblem:
         first, second, whole = (HandEvidence(self._blocks_without(out), self.space, (), baseline=used).fit(used)
                                 for out in (*np.array_split(poses, 2), ()))
         return agree((first, second), whole, [used.index(k) for k in question.parameters])
+
+    def gain(self, held_out: Sequence, before: Sequence[Question], after: Sequence[Question], *, sensor: str) -> Gain:
+        """Return the Gain of one choice over another on the poses of `HandInvestigation.held_out`, held out from both fit and choice."""
+        block = self.clearest(before, after, sensor)
+        pair = [np.full(block.known.shape, np.nan) for _ in range(2)]
+        for out, named, smaller in held_out:
+            rows = np.isin(block.pose, out)
+            for residual, choice in zip(pair, (before, after)):
+                allowed = {question.name for question in choice}
+                values = smaller.values([question for question in named if question.name in allowed])
+                residual[rows] = block.rows[rows, :, -1] - block.rows[rows, :, :-1] @ values
+        return gain_of_poses(block, pair)
+
+    def clearest(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Block:
+        """Return the rows of a sensor in which one choice improves most over another by cross-validation of the fit."""
+        squares = [[np.sum(rest**2) for rest in self.evidence.heldout_residuals(self.search.indices(choice))] for choice in (before, after)]
+        own = [k for k, block in enumerate(self.blocks) if block.sensor == sensor]
+        return self.blocks[min(own, key=lambda k: squares[1][k] / max(squares[0][k], 1e-300))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,11 +133,6 @@ class HandInvestigation(SelectedEffects):
         """Sensor -> effects for the model."""
         return {sensor: tuple(q.name for q in self.adopted if q.sensor == sensor) for sensor in SENSORS}
 
-    @property
-    def search(self) -> Search:
-        """Search of the findings."""
-        return self.problem.search
-
     @cached_property
     def unexplained(self) -> dict[str, Unexplained]:
         """Sensor -> the residual that no finding explains."""
@@ -130,14 +143,6 @@ class HandInvestigation(SelectedEffects):
         """Return effect -> initial values for its columns, of the warm-ups among the chosen effects, from the rows of `problem`."""
         fit, warm = problem.values(chosen), [question for question in chosen if '@' in question.label]
         return {q.name: np.append(fit[list(q.parameters)], self.constants[int(q.label.split('@')[1])]) for q in warm}
-
-    def gain(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Gain:
-        """Return the Gain of one choice over another on poses held out from both fit and choice."""
-        return _gain(self.problem, self.held_out, before, after, sensor)
-
-    def clearest(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Block:
-        """Return the rows of a sensor in which one choice improves most over another by cross-validation of the fit."""
-        return self.problem.blocks[_clearest(self.problem, before, after, sensor)]
 
     def extended(self, problem: HandProblem, chosen: Sequence[Question]) -> tuple[HandModel, np.ndarray, float]:
         """
@@ -208,7 +213,7 @@ def _that_predict(problem, held_out, named):
     """Return the findings that improve the prediction of poses held out from their choice."""
     named = list(named)
     while named:
-        gains = [_gain(problem, held_out, named[:k], named[:k + 1], q.sensor) for k, q in enumerate(named)]
+        gains = [problem.gain(held_out, named[:k], named[:k + 1], sensor=q.sensor) for k, q in enumerate(named)]
         poor = [q for q, gain in zip(named, gains) if not gain.ci95[0] > 0]
         if not poor:
             break
@@ -242,8 +247,8 @@ def _questions(effects, blocks, space, base, not_testable):
     """Return the questions; an effect that is collinear with the baseline in these poses is moved to `not_testable`."""
     by_name, asked = {e.name: e for e in effects}, []
     probe = HandEvidence(blocks, space, (), baseline=base)
-    for label in space.names:
-        part, name = space.parts[label], label.split('@')[0]
+    for label, part in space.parts.items():
+        name = label.split('@')[0]
         parameters = tuple(range(part.start, part.stop))
         rank = probe.rank(parameters, base)
         if rank:
@@ -264,33 +269,6 @@ def _held_out(problem):
         smaller = problem.without(out)
         found.append((out, smaller.named(), smaller))
     return found
-
-
-def _predicted(problem, held_out, allowed):
-    """Return residuals per block of poses held out from fit and choice; only effects called `allowed` are used."""
-    found = [np.full(block.known.shape, np.nan) for block in problem.blocks]
-    for out, named, smaller in held_out:
-        chosen = [q for q in named if q.name in allowed]
-        values = smaller.values(chosen)
-        for residual, block in zip(found, problem.blocks):
-            rows = np.isin(block.pose, out)
-            residual[rows] = block.rows[rows, :, -1] - block.rows[rows, :, :-1] @ values
-    return found
-
-
-def _gain(problem, held_out, before, after, sensor):
-    """Return the Gain of one choice over another on poses held out from both fit and choice."""
-    best = _clearest(problem, before, after, sensor)
-    block = problem.blocks[best]
-    pair = [_predicted(problem, held_out, {q.name for q in choice})[best] for choice in (before, after)]
-    return gain_of_poses(block, pair)
-
-
-def _clearest(problem, before, after, sensor):
-    """Return the place of the sensor's block with the largest reduction by cross-validation of the fit."""
-    inside = [problem.evidence.heldout_residuals(problem.search.indices(choice)) for choice in (before, after)]
-    own = [k for k, block in enumerate(problem.blocks) if block.sensor == sensor]
-    return min(own, key=lambda k: np.sum(inside[1][k]**2) / max(np.sum(inside[0][k]**2), 1e-300))
 
 
 def gain_of_poses(block: Block, pair: Sequence[np.ndarray], of: str = OF_MODEL) -> Gain:

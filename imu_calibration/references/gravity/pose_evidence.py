@@ -9,6 +9,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.estimation.noise_search import NoiseLikelihood
 from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.references.gravity.bias_movement import orthonormal_basis
 from imu_calibration.references.gravity.effect_rows import Block, HandSpace
 from imu_calibration.selection.evidence import Evidence
 
@@ -21,6 +22,8 @@ BIASES = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Candidate bias processes, in units of offset and noise together."""
 BIAS_TIMES = (100.0, 300.0)
 """Its correlation times, s."""
+DEPENDENT = 1e-9
+"""Singular value of scaled columns, over the largest, up to which one of them depends on the others."""
 MIN_COLUMN_DIFFERENCE = 0.1
 """Columns that differ by less than this count as collinear."""
 MIN_COLUMN_SINE = 0.2
@@ -110,27 +113,17 @@ class HandEvidence(Evidence):
     def rank(self, added: Sequence[int], smaller: Sequence[int]) -> int:
         """Return how many combinations of the added columns are not collinear with the smaller choice."""
         white = np.concatenate(self._white)
-        known, new = _basis(white[:, list(smaller)]), _basis(white[:, list(added)], MIN_COLUMN_DIFFERENCE)
+        known, new = orthonormal_basis(white[:, list(smaller)], DEPENDENT), orthonormal_basis(white[:, list(added)], MIN_COLUMN_DIFFERENCE)
         if not new.shape[1]:
             return 0
         sines = np.linalg.svd(new - known @ (known.T @ new), compute_uv=False)
         return int(np.sum(sines > MIN_COLUMN_SINE))
 
 
-def _basis(columns, least=1e-9):
-    """Return an orthonormal basis of the span of columns, maybe empty or dependent: singular values above `least` of the largest count."""
-    size = np.linalg.norm(columns, axis=0)
-    columns = columns[:, size > 0] / size[size > 0]
-    if not columns.shape[1]:
-        return columns
-    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, singular > least * singular[0]]
-
-
 def _noise(block, used):
     """Return (independent variance of each row (m, n_axes), bias processes): scatter between rows, for poses a bias process too."""
     count, axes, width = block.rows.shape
-    basis = _basis(block.rows.reshape(-1, width)[:, used])
+    basis = orthonormal_basis(block.rows.reshape(-1, width)[:, used], DEPENDENT)
     rows = np.concatenate([basis.reshape(count, axes, -1), block.rows[:, :, -1:]], axis=2)
     likelihood = NoiseLikelihood(rows, block.known, block.time, sessions=[np.arange(count)])
     biases = [(share, time) for share in BIASES[1:] for time in BIAS_TIMES] if block.name == 'poses' else []

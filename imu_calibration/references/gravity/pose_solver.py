@@ -13,14 +13,13 @@ from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, ModelErro
 from imu_calibration.estimation.row_estimate import MAX_NEWTON_STEPS, RowEstimate, estimate_rows
 from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solver import OUTLIER_P_VALUE
-from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, State, TurnData
+from imu_calibration.references.gravity.equations import COMPONENTS, SCATTER_SD, GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.turns import missed_angle
 
 
-def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float,
-                fallback: np.ndarray) -> tuple[RowEstimate, ModelError, dict]:
+def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float) -> tuple[RowEstimate, ModelError, dict]:
     """
     Return the estimate of all parameters from poses and turns, the model error in its covariance, and the turns integrated there.
 
@@ -32,11 +31,9 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
     turns : list of TurnData
     gravity_sd : float
         Sd of gravity, m/s^2.
-    fallback : array, shape (3,)
-        Variances of `COMPONENTS` where the data are too few to estimate them.
 
     """
-    found = estimate_rows(GravityRows(model, poses, turns), first_state(model, poses), fallback=fallback)
+    found = estimate_rows(GravityRows(model, poses, turns), first_state(model, poses), fallback=np.square(SCATTER_SD))
     reference, values = GravityRows(model, poses, turns), found.state.values
     error = _model_error(reference, found)
     terms = {**found.terms, **error.terms(total(found.terms)), GRAVITY: _of_gravity(model, values, gravity_sd / model.gravity),
@@ -84,11 +81,10 @@ def _of_gravity(model, values, relative_sd):
 
 def _of_earth(model, state, poses, free):
     """Return the contribution of the Earth's rate about the vertical to the covariance, through biases and responses to gravity."""
-    slopes = model.further('gyroscope', state.values, model.gravity * state.up, **poses.conditions)[1]
+    columns = model.rate_rows(state.values, model.gravity * state.up, poses.rate, **poses.conditions)[1].reshape(-1, model.size)
     own = np.concatenate([np.arange(model.size)[model.gyro_bias], model.extra_index('gyroscope')])
-    columns = np.concatenate([np.broadcast_to(np.eye(3), (len(slopes), 3, 3)), slopes], axis=2).reshape(-1, len(own))
     taken, kept = np.zeros(model.size), own[free[own]]
-    taken[kept] = np.linalg.lstsq(columns[:, free[own]], EARTH_UPWARDS_SD * state.up.ravel(), rcond=None)[0]
+    taken[kept] = np.linalg.lstsq(columns[:, kept], EARTH_UPWARDS_SD * state.up.ravel(), rcond=None)[0]
     return np.outer(taken, taken)
 
 

@@ -1,6 +1,7 @@
 """SessionData windows of sessions on a table: stored, held out for the proof, merged."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -43,8 +44,8 @@ class WindowStore:
 
     def copy(self) -> 'WindowStore':
         """Return a copy that shares the windows."""
-        twin = WindowStore(self._most, self.complete)
-        twin._entries, twin._n_samples, twin._n_static = list(self._entries), self._n_samples, self._n_static
+        twin = copy(self)
+        twin._entries = list(self._entries)
         return twin
 
     def add(self, window: Window, reduced: WindowStatistics) -> None:
@@ -240,8 +241,8 @@ class DecimatedWindows:
 
     def copy(self) -> 'DecimatedWindows':
         """Return an independent copy; the windows are shared."""
-        twin = DecimatedWindows(self.most)
-        twin.n_samples, twin._stride, twin._counts, twin._kept = self.n_samples, self._stride, dict(self._counts), list(self._kept)
+        twin = copy(self)
+        twin._counts, twin._kept = dict(self._counts), list(self._kept)
         return twin
 
     @property
@@ -287,7 +288,7 @@ class SessionData:
     temperature_c: tuple | None = None
     """Lowest and highest temperature."""
     findings: tuple = ()
-    """PoseScan of the checks of the recording before the estimate (`CheckFinding`)."""
+    """Findings of the checks of the recording before the estimate (`CheckFinding`)."""
 
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
