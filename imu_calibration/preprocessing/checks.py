@@ -13,7 +13,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.preprocessing import value_checks
 from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING, CheckFinding, EvidenceGatherer, RecordingEvidence
-from imu_calibration.preprocessing.scan import SENSOR_COLUMNS, long_runs
+from imu_calibration.preprocessing.scan import SENSOR_COLUMNS, FrozenPart, long_runs
 from imu_calibration.preprocessing.stamping import IRREGULAR, MAX_IRREGULAR_SHARE
 from imu_calibration.preprocessing.stream_cleaning import MESSAGES, BlockCleaner, CleanedBlock, StreamStatistics
 
@@ -64,37 +64,37 @@ def _in_long_runs(flags):
 
 def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every sensor and every joint measures until the end."""
-    parts = evidence.frozen_parts
-    spans = {}
-    for part in parts:
-        spans.setdefault((part.start, part.stop) if part.who != 'joints' else 'joints', []).append(part)
-    for together in spans.values():
-        if together[0].who == 'joints':
-            text = ('joint states must follow the table, they are constant while the IMU turns, '
-                    f'{_spans(together)}; check the driver of the table, or exclude the time in which the IMU was carried')
-        else:
-            who = 'IMU' if len(together) > 1 else together[0].who
-            text = (f'the {who} must measure all the time, it repeats one reading {_spans(together[:1])}, which its noise does not allow; '
-                    'check the sensor and its driver, and exclude that time')
-        samples = together[0].samples if together[0].who != 'joints' else sum(part.samples for part in together)
-        yield CheckFinding('frozen', WARNING, text, samples=samples)
+    joints = [part for part in evidence.frozen_parts if part.who == 'joints']
+    sensors: dict[tuple[float, float], list[FrozenPart]] = {}
+    for part in evidence.frozen_parts:
+        if part.who != 'joints':
+            sensors.setdefault((part.start, part.stop), []).append(part)
+    for span, parts in sensors.items():
+        yield CheckFinding('frozen', WARNING, f'the {"IMU" if len(parts) > 1 else parts[0].who} must measure all the time, it repeats '
+                           f'one reading {span_words([span])}, which its noise does not allow; check the sensor and its driver, and exclude '
+                           'that time', samples=parts[0].samples)
+    if joints:
+        yield CheckFinding('frozen', WARNING, 'joint states must follow the table, they are constant while the IMU turns, '
+                           f'{span_words([(part.start, part.stop) for part in joints])}; check the driver of the table, or exclude the time '
+                           'in which the IMU was carried', samples=sum(part.samples for part in joints))
 
 
-def _spans(parts):
-    words = [f'from {part.start:.1f} s to {part.stop:.1f} s' for part in parts[:3]]
-    return ', '.join(words) + (f' and {len(parts) - 3} times more' if len(parts) > 3 else '')
+def span_words(spans: Sequence[tuple[float, float]]) -> str:
+    """Return the first three of some times in words, each from start to stop in s."""
+    words = [f'from {start:.1f} s to {stop:.1f} s' for start, stop in spans[:3]]
+    return ', '.join(words) + (f' and {len(spans) - 3} times more' if len(spans) > 3 else '')
 
 
-FAST_STREAMS = ('imu', 'joints')
 WHOLE_MS = 1_000_000
-ADVICE = {
-    'not finite': 'the driver sends them; they are left out',
-    'repeated stamp': 'stamp each sample when it is measured; the second of equal stamps is left out',
-    'backward stamp': 'samples that arrive late are left out; publish in order',
-    'stray stamp': 'a single outlying stamp is excluded',
-    'spike': 'readings that differ from their neighbours beyond any motion are excluded; if they are many, check the bus and the driver',
-    'clock reset': 'the clock was set while recording; the parts are processed separately',
+STAMP_FAULTS = {
+    'not finite': 'are not finite: the driver sends them; they are left out',
+    'repeated stamp': 'repeat the stamp before: stamp each sample when it is measured; the second of equal stamps is left out',
+    'backward stamp': 'step back in time: samples that arrive late are left out; publish in order',
+    'stray stamp': 'have a stray stamp: a single outlying stamp is excluded',
+    'spike': 'are spikes: readings that differ from their neighbours beyond any motion are excluded; if they are many, check the bus and '
+             'the driver',
 }
+"""Reason for which samples were dropped -> what they do, and the remedy."""
 SPIKE_SHARE = 5e-3
 """Occasional knocks resemble spikes, and 1 % of spikes do not degrade a calibration; a larger share has a cause."""
 GAP_SHARE = 0.01
@@ -120,68 +120,55 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                                'is used; the driver should stamp each sample at its measurement')
         for reason, count in found.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
-            yield CheckFinding('stamps', severity, f'{MESSAGES[name]}: {count} of {total} samples {_phrase(reason)}: {ADVICE[reason]}'
-                          if reason != 'clock reset' else f'{MESSAGES[name]}: the stamps jump {_times(count)}: {ADVICE[reason]}')
+            text = f'{count} of {total} samples {STAMP_FAULTS[reason]}' if reason != 'clock reset' else (
+                f'the stamps jump {"once" if count == 1 else f"{count} times"}: the clock was set while recording; the parts are processed '
+                'separately')
+            yield CheckFinding('stamps', severity, f'{MESSAGES[name]}: {text}')
         clean += [] if found.dropped else [MESSAGES[name]]
     if clean:
         yield CheckFinding('stamps', GOOD, f'{" and ".join(clean)}: all stamps advance')
 
 
-def _phrase(reason):
-    return {'not finite': 'are not finite', 'repeated stamp': 'repeat the stamp before', 'backward stamp': 'step back in time',
-            'stray stamp': 'have a stray stamp', 'spike': 'are spikes'}[reason]
-
-
-def _times(count):
-    return 'once' if count == 1 else f'{count} times'
+def _fast_streams(evidence):
+    """Return (message type, Stream) of the IMU and the joints."""
+    return [(MESSAGES[name], evidence.streams[name]) for name in ('imu', 'joints') if name in evidence.streams]
 
 
 def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The streams have no gaps."""
-    for name in FAST_STREAMS:
-        if name in evidence.streams:
-            found = evidence.streams[name].statistics
-            if found.n_gaps:
-                severity = WARNING if found.gap_total > GAP_SHARE * found.duration else NOTE
-                yield CheckFinding('gaps', severity,
-                                   f'{MESSAGES[name]}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, '
-                                   f'{found.gap_total:.2f} s of {found.duration:.0f} s, '
-                              f'the longest {found.longest_step:.2f} s; motion within a gap is not used')
+    for name, stream in _fast_streams(evidence):
+        found = stream.statistics
+        if found.n_gaps:
+            severity = WARNING if found.gap_total > GAP_SHARE * found.duration else NOTE
+            yield CheckFinding('gaps', severity, f'{name}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s of '
+                               f'{found.duration:.0f} s, the longest {found.longest_step:.2f} s; motion within a gap is not used')
 
 
 def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The samples per second agree with the step between stamps."""
-    for name in FAST_STREAMS:
-        if name in evidence.streams:
-            stream = evidence.streams[name]
-            nominal, real = stream.statistics.rate, stream.real_rate
-            if nominal and abs(real / nominal - 1) > RATE_SHARE:
-                yield CheckFinding('sampling', WARNING,
-                                   f'{MESSAGES[name]}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is {real:.2f} Hz'
-                              'samples were lost, or stamps are made when messages arrive; '
-                              'check the driver and the load of the recorder')
-            elif nominal:
-                yield CheckFinding('sampling', GOOD, f'{MESSAGES[name]}: {real:.2f} Hz, as the steps between stamps promise')
+    for name, stream in _fast_streams(evidence):
+        nominal, real = stream.statistics.rate, stream.real_rate
+        if nominal and abs(real / nominal - 1) > RATE_SHARE:
+            yield CheckFinding('sampling', WARNING,
+                               f'{name}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is {real:.2f} Hz: '
+                               'samples were lost, or stamps are made when messages arrive; check the driver and the load of the recorder')
+        elif nominal:
+            yield CheckFinding('sampling', GOOD, f'{name}: {real:.2f} Hz, as the steps between stamps promise')
 
 
 def jitter(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Samples are evenly spaced, and stamps finer than their spacing."""
-    for name in FAST_STREAMS:
-        if name in evidence.streams:
-            stream = evidence.streams[name]
-            if (line := stream.statistics.stamping) is not None:
-                yield CheckFinding('jitter', WARNING if line.word == IRREGULAR else NOTE,
-                                   f"{MESSAGES[name]}: {line}; stamps by the sensor's own clock "
-                                   'would be better')
-            period, step_ns = stream.statistics.period, stream.statistics.stamp_step_ns
-            whole_ms = bool(step_ns) and step_ns % WHOLE_MS == 0 and step_ns < 0.5e9 * period
-            if not whole_ms and stream.irregular <= MAX_IRREGULAR_SHARE:
-                continue
-            came = f'all stamps are multiples of {step_ns // WHOLE_MS} ms' if whole_ms else ''
-            if stream.irregular > MAX_IRREGULAR_SHARE:
-                off = f'{100 * stream.irregular:.0f} % of the steps are off the usual {period * 1e3:.4g} ms by more than a tenth'
-                came = f'{came}, {off}' if came else off
-            yield CheckFinding('jitter', NOTE, f"{MESSAGES[name]}: {came}; stamps by the sensor's own clock would be better")
+    for name, stream in _fast_streams(evidence):
+        found, faults = stream.statistics, []
+        if found.stamping is not None:
+            yield CheckFinding('jitter', WARNING if found.stamping.word == IRREGULAR else NOTE,
+                               f"{name}: {found.stamping}; stamps by the sensor's own clock would be better")
+        if found.stamp_step_ns and found.stamp_step_ns % WHOLE_MS == 0 and found.stamp_step_ns < 0.5e9 * found.period:
+            faults.append(f'all stamps are multiples of {found.stamp_step_ns // WHOLE_MS} ms')
+        if stream.irregular > MAX_IRREGULAR_SHARE:
+            faults.append(f'{100 * stream.irregular:.0f} % of the steps are off the usual {found.period * 1e3:.4g} ms by more than a tenth')
+        if faults:
+            yield CheckFinding('jitter', NOTE, f"{name}: {', '.join(faults)}; stamps by the sensor's own clock would be better")
 
 
 def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:

@@ -11,7 +11,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.checks import refuse
+from imu_calibration.preprocessing.checks import refuse, span_words
 from imu_calibration.preprocessing.on_table import MIN_MATCH, TESTED_RATE, exchanged, find_exchange, match_axes, same_motion, signs_or_delay
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
 from imu_calibration.preprocessing.scan import MIN_TURN_RATE
@@ -62,13 +62,13 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
                     and not _rounded(window.rate_s[start], rate[start:stop], bias, step))
     if spans:
         return CheckFinding('frozen', REFUSE, 'the gyroscope must measure all the time, '
-                            f'it repeats one reading {_words(spans)} while the joints turn; '
+                            f'it repeats one reading {span_words(spans)} while the joints turn; '
                             'check the sensor and its driver, and exclude that time')
     for k, name in enumerate(table.joint_names):
         spans = _joined(span for window, rate in zip(windows, expected) for span in _frozen(window, table, rate + bias, joint=k))
         if spans:
             return CheckFinding('frozen', REFUSE, 'joint states must follow the table, '
-                                f'{name} is constant {_words(spans)} while the IMU turns about its '
+                                f'{name} is constant {span_words(spans)} while the IMU turns about its '
                                 'axis; check the driver of the table, and exclude that time')
     return None
 
@@ -107,11 +107,6 @@ def _joined(spans):
         else:
             joined.append((start, stop))
     return joined
-
-
-def _words(spans):
-    words = [f'from {start:.1f} s to {stop:.1f} s' for start, stop in spans[:3]]
-    return ', '.join(words) + (f' and {len(spans) - 3} times more' if len(spans) > 3 else '')
 
 
 LEAST_POWER_SHARE = {'accelerometer': 0.03, 'gyroscope': 0.01}

@@ -86,11 +86,8 @@ class ChunkSeries:
         return Chunks(time, duration, mean, sd, extent, self.size or MIN_CHUNK_SAMPLES, int(self._first_ns or 0))
 
     def _count_changes(self, columns):
-        if self._last is not None:
-            changed = columns[:, :1] != self._last
-            self.n_changed += changed[:, 0]
-            self.n_repeated += not changed.any()
-        changed = columns[:, 1:] != columns[:, :-1]
+        joined = columns if self._last is None else np.concatenate([self._last, columns], axis=1)
+        changed = joined[:, 1:] != joined[:, :-1]
         self.n_changed += np.count_nonzero(changed, axis=1)
         self.n_repeated += changed.shape[1] - int(np.count_nonzero(changed.any(axis=0)))
         self.n_samples += columns.shape[1]

@@ -1,5 +1,6 @@
 """Streams without unusable samples, in SI units, as a whole or block by block."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -312,16 +313,16 @@ class BlockCleaner:
         self._checks = {name: StreamCheck() for name in STREAMS}
         self._raw: dict[str, list] = {name: [] for name in STREAMS}
         self._ready: dict[str, list[tuple[int, Any]]] = {name: [] for name in STREAMS}
-        self.lost: dict[str, int] = {}
+        self.lost: Counter[str] = Counter()
         """Messages that could not be converted to samples: reason -> count."""
-        self.notes: dict[str, int] = {}
+        self.notes: Counter[str] = Counter()
         """Messages that were used with a modification: reason -> count."""
 
     @property
     def n_buffered(self) -> int:
         """Samples held at the moment."""
-        return sum(len(part) for parts in self._raw.values() for part in parts) + sum(len(part) for parts in self._ready.values() for _,
-                                                                                      part in parts)
+        ready = sum(len(part) for parts in self._ready.values() for _, part in parts)
+        return ready + sum(len(part) for parts in self._raw.values() for part in parts)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -354,9 +355,8 @@ class BlockCleaner:
             When the joints of the block differ from the requested ones.
 
         """
-        for found, total in ((block.dropped, self.lost), (block.notes, self.notes)):
-            for reason, count in (found or {}).items():
-                total[reason] = total.get(reason, 0) + count
+        self.lost.update(block.dropped or {})
+        self.notes.update(block.notes or {})
         for name in STREAMS:
             samples = getattr(block, name)
             if samples is not None and len(samples):

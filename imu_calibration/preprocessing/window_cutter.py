@@ -309,7 +309,7 @@ class WindowCutter:
                 continue
             if is_open:
                 decided = start
-            elif original[k] == STEADY or _between_motion(k, before, original, samples.after_gap, stop):
+            elif original[k] == STEADY or (before[k] in (STEADY, MOVING) and k + 1 < len(original) and not samples.after_gap[stop]):
                 phase[start:stop] = MOVING
         if decided < len(samples):
             self._waiting = samples.select(slice(decided, None))
@@ -410,11 +410,6 @@ def _runs(value, broken):
     begins = np.concatenate([[True], (value[1:] != value[:-1]) | broken[1:]])
     starts = np.flatnonzero(begins)
     return starts, np.append(starts[1:], len(value))
-
-
-def _between_motion(k, before, original, after_gap, stop):
-    follows = k + 1 < len(original) and not after_gap[stop]
-    return before[k] in (STEADY, MOVING) and follows
 
 
 ACCEPTED = (*_WINDOW_KINDS[1:], *_UNUSED_REASONS[1:], 'edge of joints')

@@ -1,5 +1,6 @@
 """Windows from streams: static, spinning and dynamic windows with the joints' motion, and samples with their reference."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -45,7 +46,7 @@ class MotionGatherer:
         self._epoch_shift = dict.fromkeys(STREAMS, 0)
         self._turns = _Unwrapper()
         self._floors = QuietFloor(), QuietFloor()
-        self._lost_counts = {}
+        self._lost_counts = Counter()
         self._epoch = 0
         self._chunks = MotionChunks(settings, self._noise_rad, self._floors)
         self._cutter = WindowCutter(settings, self._chunks.short_rest, keep_unused)
@@ -66,10 +67,10 @@ class MotionGatherer:
         'edge of joints': just before the first or after the last joint state, in motion. 'no joint state', 'late IMU sample',
         'imu not finite', 'joints repeated stamp', ...: dropped; 'imu clock reset': jumps. Drops reported by blocks are not included.
         """
-        counts = self.cleaner.counts
+        counts: Counter[str | UnusedReason | WindowKind] = Counter(self.cleaner.counts)
         for source in (self._lost_counts, self._chunks.counts, self._cutter.counts):
-            _add_counts(counts, source)
-        return counts
+            counts.update(source)
+        return dict(counts)
 
     def push(self, block: SampleBlock) -> list[Window]:
         """
@@ -146,7 +147,7 @@ class MotionGatherer:
         windows = self._end_epoch()
         old, self._chunks = self._chunks, MotionChunks(self._settings, self._noise_rad, self._floors)
         self._chunks.time_origin = old.end_time + self._settings.gap
-        _add_counts(self._lost_counts, old.counts)
+        self._lost_counts.update(old.counts)
         self._epoch += 1
         if not (self._queue['imu'] and self._queue['joints']):
             self._follow(old)
@@ -186,11 +187,6 @@ class _Unwrapper:
         if not turns.any():
             return joints
         return JointSamples(joints.stamp_ns, joints.position - 2 * np.pi * turns, joints.velocity, joints.names)
-
-
-def _add_counts(total, counts):
-    for reason, number in counts.items():
-        total[reason] = total.get(reason, 0) + number
 
 
 def _span(queue):
