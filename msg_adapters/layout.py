@@ -1,7 +1,7 @@
 """Layout of messages in CDR, and header stamps."""
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -34,14 +34,14 @@ class Packed:
 
     def views(self) -> list[memoryview]:
         """Return the messages without copying them."""
-        return self._parts(self.buffer.data)
+        return list(self._parts(self.buffer.data))
 
-    def copies(self) -> list[bytearray]:
-        """Return copies of the messages; SQLite binds a bytearray in half the time of bytes, for which Python looks for an adapter."""
+    def copies(self) -> Iterator[bytearray]:
+        """Yield copies of the messages; SQLite binds a bytearray in half the time of bytes, for which Python looks for an adapter."""
         return self._parts(bytearray(self.buffer))
 
     def _parts(self, data):
-        return [data[start:end] for start, end in zip(self.start.tolist(), (self.start + self.size).tolist(), strict=True)]
+        return (data[start:end] for start, end in zip(self.start.tolist(), (self.start + self.size).tolist(), strict=True))
 
     def copy_to(self, target: np.ndarray, place: np.ndarray) -> None:
         """Copy each message into the bytes `target`, from its `place` on: one gather for each size."""

@@ -361,19 +361,13 @@ class McapFile(StorageFile):
         start, = struct.unpack_from('<Q', footer, PREFIX.size)
         if not len(MAGIC) <= start < self.size:
             return
-        summary = memoryview(self._read(start, self.size - start))
-        position = 0
-        while position + PREFIX.size <= len(summary):
-            opcode, length = PREFIX.unpack_from(summary, position)
-            content = summary[position + PREFIX.size:position + PREFIX.size + length]
-            if opcode == FOOTER:
-                break
+        _, records, _ = walk(np.frombuffer(self._read(start, self.size - start), np.uint8))
+        for opcode, content in records:
             if opcode == STATISTICS:
                 self.statistics = parse_statistics(content)
             elif opcode == CHUNK_INDEX:
                 self.chunk_starts.append(struct.unpack_from('<Q', content, 16)[0])
-            self._register([(opcode, content)])
-            position += PREFIX.size + length
+        self._register(records)
         self.chunk_starts.sort()
 
     def _scan(self):

@@ -188,7 +188,7 @@ def parse_message_index(content: bytes) -> tuple[int, np.ndarray]:
     return channel, entries[1::2].astype(np.int64)
 
 
-def parse_statistics(content: memoryview) -> tuple[int, int, dict[int, int]]:
+def parse_statistics(content: bytes) -> tuple[int, int, dict[int, int]]:
     """Return (first time, last time, channel id -> messages) from a Statistics record."""
     first, last = struct.unpack_from('<QQ', content, 26)
     return first, last, dict(struct.iter_unpack('<HQ', content[46:46 + struct.unpack_from('<I', content, 42)[0]]))

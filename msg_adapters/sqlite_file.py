@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from contextlib import closing, suppress
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -222,12 +222,11 @@ class SqliteWriter:
 
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
-        values: list[Any] = [None] * (3 * len(messages))
-        values[0::3], values[1::3], values[2::3] = topic_ids.tolist(), received_ns.tolist(), messages.copies()
-        whole = 3 * (len(messages) // INSERTED_ROWS * INSERTED_ROWS)
-        for part, rows in ((values[:whole], INSERTED_ROWS), (values[whole:], 1)):
+        values = chain.from_iterable(zip(topic_ids.tolist(), received_ns.tolist(), messages.copies(), strict=True))
+        whole = len(messages) // INSERTED_ROWS * INSERTED_ROWS
+        for count, rows in ((whole, INSERTED_ROWS), (len(messages) - whole, 1)):
             self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES ' + ', '.join(['(?, ?, ?)'] * rows),
-                                        zip(*[iter(part)] * (3 * rows), strict=True))
+                                        zip(*[islice(values, 3 * count)] * (3 * rows), strict=True))
 
     def close(self, metadata_version: int, metadata: str) -> None:
         """Add the index by time and the metadata, and close."""

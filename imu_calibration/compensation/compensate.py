@@ -233,17 +233,15 @@ def arms_of(calibration: FittedErrors) -> np.ndarray:
     return np.zeros((3, 3)) if arms is None else arms
 
 
-def outside_conditions(calibration: FittedErrors, rate_s: np.ndarray,
-                       temperature_c: Sequence[float] | np.ndarray | None = None) -> list[str]:
-    """Return lines on samples outside the range of the calibration (rate, temperature)."""
+def outside_conditions(calibration: FittedErrors, fastest: float = 0.0, temperature_c: Sequence[float] | None = None) -> list[str]:
+    """Return lines on a largest rate (rad/s) and temperatures outside the range of the calibration."""
     lines = []
     largest = calibration.conditions.get('largest_rate')
-    fastest = float(np.max(np.linalg.norm(rate_s, axis=1), initial=0.0))
     if largest is not None and fastest > 1.1 * largest + 0.1:
         lines.append(f'the rate reaches {fastest:.2f} rad/s, the calibration saw {largest:.2f}; calibrate up to the rates of use')
     limits = calibration.conditions.get('temperature_range_c')
-    if limits and temperature_c is not None and len(temperature_c):
-        low, high = float(np.min(temperature_c)), float(np.max(temperature_c))
+    if limits and temperature_c:
+        low, high = min(temperature_c), max(temperature_c)
         if low < limits[0] - 5 or high > limits[1] + 5:
             lines.append(f'the temperature runs from {low:.1f} to {high:.1f} C, the calibration saw {limits[0]:.1f} to {limits[1]:.1f} C; '
                          'calibrate there')

@@ -33,10 +33,11 @@ class SampleCompensation:
     def __init__(self, calibration: FittedErrors, transfer: Transfer | None = None, with_parameters: bool = True):
         self.calibration, self.transfer, self.with_parameters = calibration, transfer, with_parameters
         self.counts, self.corrected, self.fastest_squared = Counter(), 0, 0.0
-        self.needs_temperature = invertible(calibration.model).needs_temperature
+        model = invertible(calibration.model)
+        self.needs_temperature = model.needs_temperature
         self.dt = None if self.needs_temperature else 0.0
         self.branch, self.vibration = ThermalBranch(), BandVariance()
-        self._shakes = invertible(calibration.model).uses('vibration')
+        self._shakes = model.uses('vibration')
         self.at_zero = {sensor: tuple(calibration.of(sensor, Role.OFFSET).tolist()) for sensor in SENSORS}
         self.levels = tuple(saturation_level(calibration, sensor) for sensor in SENSORS)
         self.needs_slope = uses_slope(calibration, transfer)

@@ -37,12 +37,13 @@ class CompensationStream:
 
     def __init__(self, calibration: FittedErrors, temperature: TemperatureSamples | None = None, transfer: Transfer | None = None):
         self.calibration, self.transfer, self.temperature = calibration, transfer, temperature
-        if invertible(calibration.model).needs_temperature and temperature is None:
+        model = invertible(calibration.model)
+        if model.needs_temperature and temperature is None:
             raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature',
                              code='temperature_missing')
-        if temperature is not None and invertible(calibration.model).uses('thermal branch'):
+        if temperature is not None and model.uses('thermal branch'):
             self.temperature = replace(temperature, branch=ThermalBranch().of(temperature.temperature_c))
-        self._vibration = BandVariance() if invertible(calibration.model).uses('vibration') else None
+        self._vibration = BandVariance() if model.uses('vibration') else None
         self.count, self.flagged, self.frame_id = 0, 0, ''
         self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer))
         self._uncertainty = Uncertainty(calibration, transfer)
@@ -118,8 +119,7 @@ class CompensationStream:
 
     def warnings(self) -> list[str]:
         """Return lines on samples outside the conditions of the calibration, or without correction."""
-        fastest = np.array([[self._fastest, 0.0, 0.0]])
-        lines = outside_conditions(self.calibration, fastest, self._temperatures or None)
+        lines = outside_conditions(self.calibration, self._fastest, self._temperatures)
         if self.frame_id and self.calibration.frame_id and self.frame_id != self.calibration.frame_id:
             lines.append(f"the messages carry frame_id '{self.frame_id}', the calibration is for '{self.calibration.frame_id}': "
                          'make sure that it is the same sensor')

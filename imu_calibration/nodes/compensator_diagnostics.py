@@ -83,7 +83,7 @@ class CompensatorDiagnostics:
             return []
         state = compensation.watch.health.state
         warm = [] if compensation.needs_temperature or self._temperature is None else \
-            outside_conditions(compensation.calibration, np.zeros((1, 3)), [self._temperature])
+            outside_conditions(compensation.calibration, temperature_c=[self._temperature])
         level = max(HEALTH_LEVELS[state.word], WARN if warm else OK)
         grave = HEALTH_LEVELS[state.word] == ERROR
         self._node.complaints.now('health', [*[state.message] * (HEALTH_LEVELS[state.word] == WARN), *warm], [state.message] * grave)
@@ -141,8 +141,8 @@ class CompensatorDiagnostics:
     def _outside(self, compensation):
         fastest, compensation.fastest_squared = sqrt(compensation.fastest_squared), 0.0
         temperature = None if not compensation.needs_temperature or compensation.dt is None else \
-            np.array([compensation.dt + compensation.calibration.model.temperature_ref_c])
-        return outside_conditions(compensation.calibration, np.array([[fastest, 0.0, 0.0]]), temperature)
+            [compensation.dt + compensation.calibration.model.temperature_ref_c]
+        return outside_conditions(compensation.calibration, fastest, temperature)
 
     def _warmth(self, compensation):
         """Return the faults of the temperature, when the calibration needs one."""

@@ -71,12 +71,12 @@ def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             sensors.setdefault((part.start, part.stop), []).append(part)
     for span, parts in sensors.items():
         yield CheckFinding('frozen', WARNING, f'the {"IMU" if len(parts) > 1 else parts[0].who} must measure all the time, it repeats '
-                           f'one reading {span_words([span])}, which its noise does not allow; check the sensor and its driver, and exclude '
-                           'that time', samples=parts[0].samples)
+                           f'one reading {span_words([span])}, which its noise does not allow; check the sensor and its driver, and '
+                           'exclude that time', samples=parts[0].samples)
     if joints:
         yield CheckFinding('frozen', WARNING, 'joint states must follow the table, they are constant while the IMU turns, '
-                           f'{span_words([(part.start, part.stop) for part in joints])}; check the driver of the table, or exclude the time '
-                           'in which the IMU was carried', samples=sum(part.samples for part in joints))
+                           f'{span_words([(part.start, part.stop) for part in joints])}; check the driver of the table, or exclude the '
+                           'time in which the IMU was carried', samples=sum(part.samples for part in joints))
 
 
 def span_words(spans: Sequence[tuple[float, float]]) -> str:

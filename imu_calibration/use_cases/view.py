@@ -138,12 +138,6 @@ def residual_spectrum(result: CalibrationResult, windows: Sequence[Window]) -> t
     return np.fft.rfftfreq(segment, 1 / rate)[1:], density
 
 
-def spectrum(result: CalibrationResult, windows: Sequence[Window]) -> dict[str, Any]:
-    """Return the amplitude density of the residuals within windows with motion; no lines where none is long enough."""
-    frequency, density = residual_spectrum(result, windows)
-    return {'lines': [{'frequency': float(f), **_by_sensor(density, k)} for k, f in enumerate(frequency)]}
-
-
 def _by_sensor(vectors, k):
     return {sensor: _axes(vectors[sensor][k]) for sensor in SENSORS}
 
@@ -215,8 +209,8 @@ def scene_of(coverage: Coverage, frame_id: str) -> Any:
     """Return the sphere as a SceneUpdate: the cells, earlier up directions, the next motion, the arms, the line of text."""
     found = foxglove().messages
 
-    def color(rgb, alpha=0.9):
-        return found.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
+    def color(rgb):
+        return found.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=0.9)
 
     def pose(place, turn=(0.0, 0.0, 0.0, 1.0)):
         return found.Pose(position=found.Vector3(**_named(place)), orientation=found.Quaternion(**_named(turn)))
@@ -296,14 +290,10 @@ def _topics(traces, joint_names):
 
 
 def _residual(traces, sensor, joint_names, k):
-    found = {'time': float(traces.time[k]), 'force': _vector(traces.force_s[k]), 'rate': _vector(traces.rate_s[k]),
+    found = {'time': float(traces.time[k]), 'force': _named(traces.force_s[k]), 'rate': _named(traces.rate_s[k]),
              'angle': dict(zip(joint_names, traces.position[k].tolist())),
-             **{when: _vector(getattr(traces, when)[sensor][k]) for when in WHEN}}
+             **{when: _named(getattr(traces, when)[sensor][k]) for when in WHEN}}
     return found if traces.temperature_c is None else found | {'temperature_c': float(traces.temperature_c[k])}
-
-
-def _vector(values):
-    return dict(zip(AXES, values.tolist()))
 
 
 def _by_axis(values):
@@ -380,10 +370,10 @@ def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **cho
     path = None if isinstance(source, SampleBlock) else _document_of(Path(source))
     if path is None:
         result = calibrate(source, table, **choices).result
-        contents = {PARAMETERS_TOPIC: parameters(result.calibration, result.tolerances), RESIDUAL_TOPIC: residual(result),
-                    SPECTRUM_TOPIC: spectrum(result, result.gathered.kept)}
-        if not contents[SPECTRUM_TOPIC]['lines']:
-            del contents[SPECTRUM_TOPIC]
+        contents = {PARAMETERS_TOPIC: parameters(result.calibration, result.tolerances), RESIDUAL_TOPIC: residual(result)}
+        frequency, density = residual_spectrum(result, result.gathered.kept)
+        if len(frequency):
+            contents[SPECTRUM_TOPIC] = {'lines': [{'frequency': float(f), **_by_sensor(density, k)} for k, f in enumerate(frequency)]}
         return View(result.calibration, contents, _coverage(result), contents[RESIDUAL_TOPIC]['windows'][-1]['time'])
     if table is not None:
         raise InputError('a table or arm needs a recording, a calibration file was given; '

@@ -163,8 +163,8 @@ def test_readings_that_are_not_finite_leave_their_neighbours_alone():
 
 def test_conditions_of_the_calibration_are_watched():
     calibration = random_calibration(1, conditions={'largest_rate': 2.0, 'temperature_range_c': [20.0, 30.0]})
-    assert outside_conditions(calibration, np.array([[1.0, 0, 0]]), np.array([22.0])) == []
-    fast, hot = outside_conditions(calibration, np.array([[4.0, 0, 0]]), np.array([50.0]))
+    assert outside_conditions(calibration, 1.0, [22.0]) == []
+    fast, hot = outside_conditions(calibration, 4.0, [50.0])
     assert 'the rate reaches 4.00' in fast and '50.0 C' in hot
 
 

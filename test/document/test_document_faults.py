@@ -84,7 +84,7 @@ KNOWN_TO_WORK = set()
 def use(found):
     """Do with a calibration all that a robot does; fails with any error and with any number that is not finite."""
     refused = list(trust.refused_sensors(found, live=True))
-    against = refused, trust.caveats(found), decisions_text(found.decisions), outside_conditions(found, np.ones((1, 3)), np.array([25.0]))
+    against = refused, trust.caveats(found), decisions_text(found.decisions), outside_conditions(found, 3**0.5, [25.0])
     assert '\n' not in ''.join(line for part in against for line in part)
     assert to_mapping(found)
     noise = [found.noise(sensor) for sensor in ('accelerometer', 'gyroscope')]
