@@ -236,27 +236,10 @@ def _stays(effect, sensors):
     return effect.sensor == 'reference' or not any(group.uses & READINGS[sensor] for sensor in sensors for group in effect.groups)
 
 
-MAX_MISFIT_RATIO = 10.0
-"""Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
-NOTED_MISFIT = 2.0
-"""From this factor on the misfit is worth a note."""
 SHOWN_NAMES = 6
 """Names listed one by one; of more, the groups are named."""
 HAND_AXES = 'accelerometer_lower_triangular'
 """The axes of a calibration by hand."""
-
-
-def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:
-    """Return kind of window -> ratio of the residual variance of the sensor to that of its noise and of errors of the stamps."""
-    chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
-    by_stamps = (calibration.statistics.get('stamp_jitter') or {}).get('variance_ratio', {}).get(sensor, {})
-    return {kind: ratio / by_stamps.get(kind, 1.0) for kind, ratio in chi2.items() if kind != 'means'}
-
-
-def rested(calibration: Calibration) -> bool:
-    """Return whether a recording on a table has rests, from which the noise is known."""
-    windows = calibration.statistics.get('windows')
-    return windows is None or bool(windows.get('static'))
 
 
 def listed(names: Sequence[str]) -> str:

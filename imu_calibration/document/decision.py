@@ -80,13 +80,6 @@ def harmed(entry: Mapping) -> dict[str, Any]:
             and part['ci95'][0] > 1.0}
 
 
-def helps_everywhere(entry: Mapping | None) -> bool:
-    """Return whether an entry of a proof shows a smaller error in total and in each regime."""
-    if decide(entry) is not HELPS or entry is None:
-        return False
-    return not any(part['after'] >= part['before'] or part['ci95'][1] >= 1.0 for part in (entry.get('regimes') or {}).values())
-
-
 def _errors(entry, unit):
     return f'error {error_text(entry["before"], unit)} to {error_text(entry["after"], unit)}'
 

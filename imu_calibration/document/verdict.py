@@ -1,22 +1,12 @@
 """The verdict of a calibration and its notes."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from imu_calibration.core.units import error_text, for_people, significant
-from imu_calibration.document.calibration import (
-    HAND_AXES,
-    MAX_MISFIT_RATIO,
-    NOTED_MISFIT,
-    SHOWN_NAMES,
-    Calibration,
-    beyond_known,
-    implausible,
-    listed,
-    misfit_ratios,
-    rested,
-)
+from imu_calibration.document.calibration import HAND_AXES, SHOWN_NAMES, Calibration, beyond_known, implausible, listed
 from imu_calibration.document.decision import (
     DECISION,
     HELPS,
@@ -27,7 +17,6 @@ from imu_calibration.document.decision import (
     Reason,
     Verdict,
     decide,
-    helps_everywhere,
     lines_of,
     reason_of,
     worse_regimes,
@@ -37,6 +26,10 @@ from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
 from imu_calibration.estimation.solution import COMMON_SCALE, DETERMINED, HELD, Status
 from imu_calibration.preprocessing.window import UnusedReason
 
+MAX_MISFIT_RATIO = 10.0
+"""Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
+NOTED_MISFIT = 2.0
+"""From this factor on the misfit is worth a note."""
 LOST_SHARE = 0.05
 """A warning is issued when more than this share of the samples is lost."""
 
@@ -118,6 +111,26 @@ def _with_size(calibration, name):
     best = part.start + int(np.argmax(np.abs(calibration.values[part]) / np.maximum(calibration.sd[part], 1e-300)))
     factor, unit = for_people(effect.unit_of(best - part.start), calibration.param_names[best])
     return f'{name} ({significant(calibration.values[best] * factor)} ± {significant(calibration.sd[best] * factor, 2)} {unit})'
+
+
+def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:
+    """Return kind of window -> ratio of the residual variance of the sensor to that of its noise and of errors of the stamps."""
+    chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
+    by_stamps = (calibration.statistics.get('stamp_jitter') or {}).get('variance_ratio', {}).get(sensor, {})
+    return {kind: ratio / by_stamps.get(kind, 1.0) for kind, ratio in chi2.items() if kind != 'means'}
+
+
+def rested(calibration: Calibration) -> bool:
+    """Return whether a recording on a table has rests, from which the noise is known."""
+    windows = calibration.statistics.get('windows')
+    return windows is None or bool(windows.get('static'))
+
+
+def helps_everywhere(entry: Mapping | None) -> bool:
+    """Return whether an entry of a proof shows a smaller error in total and in each regime."""
+    if decide(entry) is not HELPS or entry is None:
+        return False
+    return not any(part['after'] >= part['before'] or part['ci95'][1] >= 1.0 for part in (entry.get('regimes') or {}).values())
 
 
 def misfits(calibration: Calibration) -> list[Reason]:

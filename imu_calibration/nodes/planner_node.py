@@ -27,14 +27,7 @@ from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text
-from imu_calibration.kinematics.motion_limits import (
-    NOT_CHECKED,
-    TrajectoryPoints,
-    limit_words,
-    limits_of,
-    missing_ranges,
-    range_warnings,
-)
+from imu_calibration.kinematics.motion_limits import NOT_CHECKED, TrajectoryPoints, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.nodes.calibration_status import driven_markers
 from imu_calibration.nodes.complaints import LOG_ERROR, LOG_INFO, Complaints, say
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status

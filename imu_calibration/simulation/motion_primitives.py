@@ -11,9 +11,6 @@ from imu_calibration.simulation.motion_builder import MotionBuilder
 
 GOLDEN_ANGLE_DEG = 137.50776
 FACES = np.concatenate([np.eye(3), -np.eye(3)])
-EDGES = np.array([[a, b, 0] for a in (1, -1) for b in (1, -1)] + [[a, 0, b] for a in (1, -1) for b in (1, -1)]
-                 + [[0, a, b] for a in (1, -1) for b in (1, -1)]) / np.sqrt(2)
-CORNERS = np.array([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)]) / np.sqrt(3)
 
 
 def pose_deg(up_b: np.ndarray, heading_deg: float = 0.0) -> np.ndarray:
@@ -100,19 +97,6 @@ def simultaneous(speeds_deg: tuple[float, float] | np.ndarray, dwell: float) -> 
     a, b = speeds_deg
     return [partial(two_axes, at_deg=at, rates_deg=rates, dwell=dwell) for at, rates in (
         ([0, 0, 0], [a, 0, b]), ([0, 0, 0], [a, b, 0]), ([0, 0, 90], [a, -b, 0]), ([0, 45, 0], [a, 0, -b]), ([0, 0, 30], [0, b, a]))]
-
-
-def at_angles(builder: MotionBuilder, angles_deg: np.ndarray) -> None:
-    """Rest at joint angles."""
-    builder.move(angles_deg)
-    builder.rest(4.0)
-
-
-def swing_joints(builder: MotionBuilder, at_deg: np.ndarray, amplitude_deg: np.ndarray, *, frequency: ArrayLike) -> None:
-    """Swing one or several joints about joint angles."""
-    builder.move(at_deg)
-    builder.rest(1.0)
-    builder.oscillate(amplitude_deg, frequency, 4.0)
 
 
 AXIS_ORDERS = ('XYX', 'XYZ', 'XZX', 'XZY', 'YXY', 'YXZ', 'YZX', 'YZY', 'ZXY', 'ZXZ', 'ZYX', 'ZYZ')

@@ -13,10 +13,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation import motion_primitives
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, stretch
 from imu_calibration.simulation.motion_primitives import (
-    CORNERS,
-    EDGES,
     FACES,
-    at_angles,
     poses,
     rest_at_zero,
     run,
@@ -24,11 +21,13 @@ from imu_calibration.simulation.motion_primitives import (
     spin_joint,
     spin_vertical,
     swing,
-    swing_joints,
     swings,
-    tumble,
     two_axes,
 )
+
+EDGES = np.array([[a, b, 0] for a in (1, -1) for b in (1, -1)] + [[a, 0, b] for a in (1, -1) for b in (1, -1)]
+                 + [[0, a, b] for a in (1, -1) for b in (1, -1)]) / np.sqrt(2)
+CORNERS = np.array([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)]) / np.sqrt(3)
 
 MAX_PROFILE_SWING = 0.5
 """Amplitude of a swing at most, rad or m."""
@@ -255,15 +254,15 @@ def _thermal(builder, _rng):
 def _navigation(builder, _rng):
     """Rest, 50 s of slow tumbling, rest, 50 s of livelier motion: for dead reckoning from either rest."""
     builder.rest(10.0)
-    tumble(builder, [70.0, 50.0, 60.0], [0.11, 0.17, 0.13], phase=[0.3, 1.1, 2.0], duration=50.0)
+    motion_primitives.tumble(builder, [70.0, 50.0, 60.0], [0.11, 0.17, 0.13], phase=[0.3, 1.1, 2.0], duration=50.0)
     builder.rest(10.0)
-    tumble(builder, [40.0, 25.0, 20.0], [0.31, 0.53, 0.71], phase=[0.3, 1.1, 2.0], duration=50.0)
+    motion_primitives.tumble(builder, [40.0, 25.0, 20.0], [0.31, 0.53, 0.71], phase=[0.3, 1.1, 2.0], duration=50.0)
     builder.rest(5.0)
 
 
 def _tumbling(builder, _rng):
     builder.rest(5.0)
-    tumble(builder, [60.0, 45.0, 30.0], [0.7, 0.9, 1.1], phase=[0.3, 1.1, 2.0], duration=60.0)
+    motion_primitives.tumble(builder, [60.0, 45.0, 30.0], [0.7, 0.9, 1.1], phase=[0.3, 1.1, 2.0], duration=60.0)
     builder.rest(5.0)
 
 
@@ -294,16 +293,22 @@ def _near(rng, direction, spread):
     return vector / np.linalg.norm(vector)
 
 
+def _swing_freely(builder, at_deg, amplitude_deg, frequency):
+    builder.move(at_deg)
+    builder.rest(1.0)
+    builder.oscillate(amplitude_deg, frequency, 4.0)
+
+
 def _any_table(builder, rng):
     """Poses, spins at three speeds, swings and two joints at once for any number of joints."""
     count = builder.n_joints
     angles = rng.permuted(np.tile(np.arange(24) * 15.0, (count, 1)), axis=1).T
-    tasks = [partial(at_angles, angles_deg=row) for row in angles]
+    tasks = [partial(_rest_at, position=np.radians(row)) for row in angles]
     only = np.eye(count)
     for joint in range(count):
         tasks += [partial(spin_joint, joint=joint, at_deg=rng.uniform(-180, 180, count), speeds_deg=speed, dwell=4.0)
                   for speed in SPEEDS_DEG]
-        tasks += [partial(swing_joints, at_deg=rng.uniform(-180, 180, count), amplitude_deg=10.0 / cycles * only[joint], frequency=cycles)
+        tasks += [partial(_swing_freely, at_deg=rng.uniform(-180, 180, count), amplitude_deg=10.0 / cycles * only[joint], frequency=cycles)
                   for cycles in (0.5, 1.0, 2.0)]
         tasks += [partial(two_axes, at_deg=at_deg, rates_deg=120.0 * only[joint] + 80.0 * only[other], dwell=5.0)
                   for other in range(joint) for at_deg in rng.uniform(-180, 180, (3, count))]

@@ -9,9 +9,8 @@ import imu_calibration as imu
 from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import timing_lines
 from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
-from imu_calibration.document.calibration import NOTED_MISFIT, misfit_ratios
 from imu_calibration.document.decision import WARNING
-from imu_calibration.document.verdict import misfits
+from imu_calibration.document.verdict import NOTED_MISFIT, misfit_ratios, misfits
 from imu_calibration.kinematics.table import Table
 from imu_calibration.selection.stamp_jitter import jitter_ratio, stamp_jitter
 

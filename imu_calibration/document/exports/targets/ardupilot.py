@@ -4,19 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from imu_calibration.core.documents import plain
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.exports.affine import OFFSETS, SCALES, THERMAL_OFFSETS, AffineImu, forward_right_down, of
-from imu_calibration.document.exports.target import (
-    AXIS_LETTERS,
-    Page,
-    Read,
-    Target,
-    commented,
-    plain,
-    read_parameters,
-    refuse_curved,
-    vector_of,
-)
+from imu_calibration.document.exports.target import AXIS_LETTERS, Page, Read, Target, commented, read_parameters, refuse_curved, vector_of
 from imu_calibration.effects.base import SENSORS
 
 OFFSET = {'accelerometer': 'INS_ACCOFFS', 'gyroscope': 'INS_GYROFFS'}

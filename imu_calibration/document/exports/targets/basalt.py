@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from imu_calibration.document.exports.affine import MATRICES, OFFSETS, THERMAL_OFFSETS, AffineImu, accelerometer_lower
-from imu_calibration.document.exports.target import Noise, Page, Read, Target, numbers_at, plain, read_json, section
+from imu_calibration.core.documents import plain
+from imu_calibration.document.exports.affine import MATRICES, OFFSETS, THERMAL_OFFSETS, AffineImu, Placement, lower_times_rotation
+from imu_calibration.document.exports.target import Noise, Page, Read, Target, numbers_at, read_json, section
 
 LOWER_BY_COLUMNS = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
 
@@ -40,6 +41,11 @@ def noise(found: Noise) -> dict:
     accel, gyro = found.accelerometer, found.gyroscope
     return {'imu_update_rate': found.rate, 'accel_noise_std': [accel.white] * 3, 'gyro_noise_std': [gyro.white] * 3,
             'accel_bias_std': [accel.walk] * 3, 'gyro_bias_std': [gyro.walk] * 3}
+
+
+def accelerometer_lower(imu: AffineImu) -> Placement:
+    """Return the placement in which the accelerometer's matrix is lower triangular."""
+    return Placement(mat_ts=lower_times_rotation(imu.matrix['accelerometer'])[1])
 
 
 def write(page: Page) -> str:

@@ -6,16 +6,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError, shortened
-from imu_calibration.document.exports.affine import (
-    ARMS,
-    G_SENSITIVITY,
-    MATRICES,
-    SLOW_OFFSETS,
-    AffineImu,
-    Placement,
-    accelerometer_lower_at_x,
-    lower_times_rotation,
-)
+from imu_calibration.document.exports.affine import ARMS, G_SENSITIVITY, MATRICES, SLOW_OFFSETS, AffineImu, Placement, lower_times_rotation
 from imu_calibration.document.exports.target import Noise, Page, Read, Target, numbers_at, read_yaml, section, yaml_file
 from imu_calibration.effects.base import SENSORS
 
@@ -80,6 +71,11 @@ def read(content: bytes, _path: str | Path) -> Read:
     found = {'model': mapping.get('model'), 'accelerometers': {'M': numbers_at(a, 'M', (3, 3), what=what), **arms},
              'gyroscopes': {name: numbers_at(g, name, (3, 3), what=what) for name in ('M', 'C_gyro_i', 'A')}}
     return Read(found, () if arms else ARMS, read_densities(mapping))
+
+
+def accelerometer_lower_at_x(imu: AffineImu) -> Placement:
+    """Return the placement with a lower triangular accelerometer matrix and the origin in the sensitive point of the x accelerometer."""
+    return Placement(mat_ts=lower_times_rotation(imu.matrix['accelerometer'])[1], origin_s=imu.arms[0])
 
 
 def at_the_mean(found: AffineImu) -> Placement:

@@ -5,16 +5,18 @@ from pathlib import Path
 
 import numpy as np
 
-from imu_calibration.document.exports.affine import (
-    G_SENSITIVITY,
-    MATRICES,
-    SLOW_OFFSETS,
-    AffineImu,
-    lower_times_rotation,
-    upper_times_rotation,
-)
+from imu_calibration.document.exports.affine import G_SENSITIVITY, MATRICES, SLOW_OFFSETS, AffineImu, lower_times_rotation
 from imu_calibration.document.exports.target import Page, Read, Target, numbers_at, read_yaml, section, yaml_file
 from imu_calibration.document.exports.targets.kalibr import noise, read_densities
+
+_TURNED_ROUND = np.eye(3)[::-1]
+
+
+def upper_times_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (U, Q) with ``matrix = U @ Q``: U upper triangular with positive diagonal, Q a rotation."""
+    lower, rotation = lower_times_rotation(_TURNED_ROUND @ matrix @ _TURNED_ROUND)
+    return _TURNED_ROUND @ lower @ _TURNED_ROUND, _TURNED_ROUND @ rotation @ _TURNED_ROUND
+
 
 SHAPES = {'lower': lower_times_rotation, 'upper': upper_times_rotation}
 MATRIX_KEYS = ('Tw', 'R_IMUtoGYRO', 'Ta', 'R_IMUtoACC', 'Tg')

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from imu_calibration.core.documents import plain
 from imu_calibration.core.errors import InputError
-from imu_calibration.document.exports.target import Page, Read, Target, plain, read_json
+from imu_calibration.document.exports.target import Page, Read, Target, read_json
 from imu_calibration.effects.base import SENSORS
 
 MAT_HEADER = b'MATLAB 5.0 MAT-file'
