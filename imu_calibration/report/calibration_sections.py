@@ -70,12 +70,11 @@ def _bars(figure, result, live):
     axes.axvline(1.0, color=INK, lw=1.0)
     axes.annotate('tolerance', (1.0, len(names) - 0.2), ha='center', va='bottom', fontsize=8.5, color=INK, annotation_clip=False)
     log_axis(axes.xaxis)
-    axes.set_xlim(low, max(10.0, 2 * float(share.max())))
-    axes.set_ylim(-0.8, len(names) - 0.2)
+    axes.set(xlim=(low, max(10.0, 2 * float(share.max()))), ylim=(-0.8, len(names) - 0.2),
+             xlabel='standard deviation / tolerance (left is better)')
     axes.set_yticks(place, [short_name(name) for name in names], fontsize=8)
     axes.tick_params(axis='y', length=0)
     axes.grid(axis='y', visible=False)
-    axes.set_xlabel('standard deviation / tolerance (left is better)')
 
 
 def _stems(figure, values):
@@ -88,11 +87,9 @@ def _stems(figure, values):
     axes.scatter(place, values, s=14, c=colours, zorder=3)
     axes.axhline(1.0, color=INK, lw=1.0)
     log_axis(axes.yaxis)
-    axes.set_xlim(0, len(place) + 1)
+    axes.set(xlim=(0, len(place) + 1), xlabel='direction, best determined first', ylabel='tolerances per sd')
     axes.set_ylim(bottom=min(0.3, values.min() / 2))
     axes.grid(axis='x', visible=False)
-    axes.set_xlabel('direction, best determined first')
-    axes.set_ylabel('tolerances per sd')
 
 
 def _heat_map(figure, matrix, names):
@@ -111,10 +108,8 @@ def _heat_map(figure, matrix, names):
     axes.set_yticks(middles, labels)
     axes.tick_params(length=0)
     axes.grid(visible=False)
-    for side in axes.spines.values():
-        side.set_visible(False)
-    bar = figure.colorbar(image, ax=axes, shrink=0.6, pad=0.02)
-    bar.outline.set_visible(False)
+    axes.spines[:].set_visible(False)
+    figure.colorbar(image, ax=axes, shrink=0.6, pad=0.02).outline.set_visible(False)
 
 
 CAUSE_COLOURS = {'noise': '#1f66a8', 'levelling': '#c0561b', 'joint position': '#2b8a57', 'table rate': '#8a5aa8', 'gravity': '#b8860b'}
@@ -152,11 +147,9 @@ def _dots(figure, result, budget):
     axes.plot(total, place, '|', color=INK, markersize=13, mew=1.6, label='total', ls='none')
     axes.axvline(1.0, color=INK, lw=1.0)
     log_axis(axes.xaxis)
-    axes.set_xlim(MIN_DRAWN_SHARE, 3 * highest)
-    axes.set_ylim(-0.7, len(effects) - 0.3)
+    axes.set(xlim=(MIN_DRAWN_SHARE, 3 * highest), ylim=(-0.7, len(effects) - 0.3), xlabel='largest standard deviation / tolerance')
     axes.set_yticks(place, [short_name(f'{e.sensor}.{e.name}') for e, _ in effects])
     axes.tick_params(axis='y', length=0)
-    axes.set_xlabel('largest standard deviation / tolerance')
     axes.legend(ncols=6, loc='lower center', bbox_to_anchor=(0.45, 1.0), columnspacing=1.2, handletextpad=0.1)
 
 

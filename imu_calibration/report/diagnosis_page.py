@@ -110,14 +110,12 @@ def _against_cause(figure, diagnosis, sensor, against):
     for axes, residual, colour, title in ((left, before, BEFORE, 'before'), (right, after, AFTER, 'after')):
         axes.plot(values[some], residual[some], '.', color=colour, markersize=_marker(values, 4), alpha=0.5, mew=0)
         axes.axhline(0, color=GREY, lw=0.6)
-        axes.set_title(title)
-        axes.set_xlabel(label)
+        axes.set(title=title, xlabel=label)
     place, curve = _curve(values, before - after)
     left.plot(place, curve, color=INK, lw=1.8, label='fitted effect')
     left.legend(loc='best')
-    left.set_ylabel(f'{sensor} {"xyz"[axis]} residual, {unit}')
     limit = 1.1 * float(np.quantile(np.abs(np.concatenate([before, after])), 0.998))
-    left.set_ylim(-limit, limit)
+    left.set(ylabel=f'{sensor} {"xyz"[axis]} residual, {unit}', ylim=(-limit, limit))
 
 
 def _marker(values, many):

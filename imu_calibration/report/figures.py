@@ -188,9 +188,8 @@ def _spectra(figure, tones):
         axes.axhline(MIN_LINE_POWER, color=GREY, lw=0.6)
         axes.axvline(tone.frequency, color=INK, lw=0.8, ls=':')
         log_axis(axes.yaxis)
-        axes.set_title(f'{tone.sensor} {tone.axis}')
-        axes.set_ylabel('relative power')
-        axes.set_xlabel('frequency, Hz' if tone.joint is None else f'cycles per turn of {tone.joint}')
+        axes.set(title=f'{tone.sensor} {tone.axis}', ylabel='relative power',
+                 xlabel='frequency, Hz' if tone.joint is None else f'cycles per turn of {tone.joint}')
 
 
 PLANES = ((0, 1), (0, 2), (1, 2))

@@ -177,7 +177,5 @@ def _growths(figure, before, after, parts):
             if values[-1] > 0:
                 axes.plot(part.time[1:], values, color=GREY, lw=1.0, ls=dash, label=label)
         log_axis(axes.yaxis)
-        axes.set_title(f'{name} error, {unit}')
-        axes.set_xlabel('time, s')
-        axes.set_xlim(0, before.time[-1])
+        axes.set(title=f'{name} error, {unit}', xlabel='time, s', xlim=(0, before.time[-1]))
     figure.axes[0].legend(loc='lower right', fontsize=8)

@@ -33,8 +33,7 @@ def _curves(figure, result, sensor):
     axes.set_ylim(np.nanmin(shown[shown > 0]) / 2.5, np.nanmax(shown) * 2.0)
     noisiest = max((result.axes[k].terms for k in own), key=lambda terms: terms[WHITE.name].interval[1])
     _slopes(axes, curve.tau, noisiest, factor)
-    axes.set_xlabel('averaging time τ, s')
-    axes.set_ylabel(f'Allan deviation, {unit}')
+    axes.set(xlabel='averaging time τ, s', ylabel=f'Allan deviation, {unit}')
     from matplotlib.lines import Line2D
     handles = [Line2D([], [], color=hue, marker=MARKER[name], markersize=4, lw=1.3, label=name) for name, hue in AXIS_COLOURS.items()]
     if any(result.record.trends[k] for k in own):

@@ -37,9 +37,7 @@ def _paint(figure, steps, rows):
         if place < len(steps):
             _box(axis, steps[place].up)
             axis.set_title(f'{place + 1}: {direction_words(steps[place].up)} up', fontsize=8, color=INK)
-            axis.set_aspect('equal')
-            axis.set_xlim(-1.7, 1.7)
-            axis.set_ylim(-1.5, 1.6)
+            axis.set(aspect='equal', xlim=(-1.7, 1.7), ylim=(-1.5, 1.6))
 
 
 def _box(axis, up):
@@ -94,8 +92,7 @@ def _motion(figure, plan):
         axes.fill_between([begin, end], top, top + 0.06 * (top - bottom), color=KIND[motion.kind], lw=0,
                           label=None if motion.kind in shown else str(motion.kind))
         shown.add(motion.kind)
-    axes.set_xlabel('time, s')
-    axes.set_ylabel('position')
+    axes.set(xlabel='time, s', ylabel='position')
     axes.legend(ncols=4, loc='upper center', bbox_to_anchor=(0.5, -0.16))
 
 
@@ -112,8 +109,7 @@ def _progress(figure, plan):
     axes.axhline(1.0, color=FAINT, ls='--', lw=1.2)
     axes.annotate('tolerance', (time[-1], 1.0), (-4, 4), textcoords='offset points', ha='right', color=GREY, fontsize=8)
     log_axis(axes.yaxis)
-    axes.set_xlabel('time, s')
-    axes.set_ylabel('sd / tolerance')
+    axes.set(xlabel='time, s', ylabel='sd / tolerance')
     axes.legend(loc='upper right')
     if 0 < plan.lower_bound_seconds < np.inf and not plan.missing:
         axes.axvline(plan.lower_bound_seconds, color=FAINT, lw=1.2)

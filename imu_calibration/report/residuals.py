@@ -34,11 +34,9 @@ def _windows(figure, errors, sensor):
     order = np.argsort(errors.time)
     lower.fill_between(errors.time[order], -floor[order], floor[order], step='mid', color='#dfe5ec', lw=0, zorder=0.5)
     _points(lower, errors.time, errors.after[sensor] * factor)
-    upper.set_title(f'{sensor}, raw')
-    lower.set_title('corrected; grey: two sd of the noise')
-    for axes in (upper, lower):
+    for axes, title in ((upper, f'{sensor}, raw'), (lower, 'corrected; grey: two sd of the noise')):
         axes.axhline(0, color=GREY, lw=0.6)
-        axes.set_ylabel(unit)
+        axes.set(title=title, ylabel=unit)
     lower.set_xlabel('time, s')
     axis_legend(upper, 'lower right', bbox_to_anchor=(0.56, 1.0), borderaxespad=0.1)   # visible on a narrow screen without scrolling
 
@@ -85,8 +83,6 @@ def _autocorrelations(figure, traces):
         for (name, colour), column in zip(AXIS_COLOURS.items(), values[1:].T):
             axes.plot(lags[1:], column, color=colour, lw=1.0, marker=MARKER[name], markersize=3, markevery=max(1, len(column) // 12))
         limit = max(0.15, 1.1 * float(np.max(np.abs(values[1:]))))
-        axes.set_ylim(-limit, limit)
-        axes.set_title(sensor)
-        axes.set_xlabel('lag, s')
+        axes.set(title=sensor, xlabel='lag, s', ylim=(-limit, limit))
     panels[0].set_ylabel('autocorrelation')
     axis_legend(panels[-1])
