@@ -28,25 +28,25 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.use_cases.inspect import imu_topics_of, inspect
     from imu_calibration.use_cases.recordings import Topics, existing
     from imu_calibration.use_cases.stand import table_of
-    bag, choices, stand = existing(options.bag), choices_of(options), stand_of(options)
+    bag, choices, stand, hints = existing(options.bag), choices_of(options), stand_of(options), hints_of(options)
     topics = imu_topics_of(bag, topics_of(choices))
     table = None if stand is None else table_of(stand, [options.bag], Topics(topics[0].imu, frame=topics[0].frame))
     looks = inspect(bag, topics, table, options=calibration_options(choices))
     out = Terminal.standard()
     _show_topics(out, looks)
-    _show_unread(out, looks[0].recording, hints_of(options))
+    _show_unread(out, looks[0].recording, hints)
     codes = []
     for look in looks:
         out.print()
         if len(looks) > 1:
             frame = look.recording.frame_id
             out.print(look.recording.imu_topic + ('' if frame is None else f' ({frame})'), style='bold')
-        show_findings(out, look.findings, hints_of(options))
+        show_findings(out, look.findings, hints)
         for reason, count in look.lost.items():
             out.print(f'lost: {count} {reason}')
-        codes.append(max(look.exit_code, _judge(out, look, hints_of(options))))
+        codes.append(max(look.exit_code, _judge(out, look, hints)))
         if look.by_hand is not None:
-            _show_by_hand(out, look.by_hand, hints_of(options))
+            _show_by_hand(out, look.by_hand, hints)
     if set(codes) == {1}:   # no topic is usable: also one line on standard error, as every refusal
         refuse(looks[0].findings)
     return VerbResult(3 if any(codes) else 0, {'topics': [asdict(topic) for topic in looks[0].recording.topics],

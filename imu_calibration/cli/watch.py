@@ -73,16 +73,13 @@ class NodeWatcher:
         import rclpy
         from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.executors import SingleThreadedExecutor
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from visualization_msgs.msg import MarkerArray
         self.name, self.statuses, self.others, self.picture, self.heard = name, {}, set(), '', time.monotonic()
         self._node = rclpy.create_node('imu_calibration_watch', context=context)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self._node)
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._take, 100)
-        self._listen_to_picture(name)
-
-    def _listen_to_picture(self, name):
-        from rclpy.qos import DurabilityPolicy, QoSProfile
-        from visualization_msgs.msg import MarkerArray
         topic = '/' + '/'.join([*name.split('/')[:-1], 'imu/coverage'])
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._node.create_subscription(MarkerArray, topic, self._draw, latched)

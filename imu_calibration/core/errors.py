@@ -8,17 +8,9 @@ local name: an option of the command line, a parameter or topic of a node, an ar
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-ERROR_KEYS = {
-    'allow_xacro': 'permission to run a .xacro file',
-    'anyway': 'consent to use an unproven calibration', 'calibration': 'the calibration document',
-    'columns': 'the columns of a text log', 'diagnose': 'the diagnosis of model errors', 'force': 'consent to overwrite another result',
-    'frame_id': 'the frame of the IMU', 'gravity': 'the local gravity', 'imu_topic': 'the topic of the IMU',
-    'inspect': 'the check of a recording', 'jobs': 'the number of processes', 'joint_topic': 'the topic of the joints',
-    'noise': 'the figures of the noise', 'nominal': 'nominal conversion of volts or counts', 'scheduler': 'the address of a cluster',
-    'setting': 'how windows are found', 'table': 'the description of the table', 'target_frame': 'the frame to move readings to',
-    'temperature_topic': 'the topic of the temperature', 'imu_link': 'the link that carries the IMU', 'up': 'where up is',
-    'urdf': 'the robot description',
-}
+ERROR_KEYS = ('allow_xacro', 'anyway', 'calibration', 'columns', 'diagnose', 'force', 'frame_id', 'gravity', 'imu_link', 'imu_topic',
+              'inspect', 'jobs', 'joint_topic', 'nominal', 'noise', 'scheduler', 'setting', 'table', 'target_frame', 'temperature_topic',
+              'up', 'urdf')
 """Inputs that an error may request, and programs that a remedy may need."""
 OFFERS = {'anyway': ', or give your consent', 'nominal': ', or give a nominal scaling'}
 """Key -> a second remedy, which is offered only where the key has a name."""

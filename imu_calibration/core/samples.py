@@ -1,6 +1,6 @@
 """Arrays of samples from a bag or a topic, independent of messages and files."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,21 +32,14 @@ class _Columns:
 
     def select(self, index):
         """Return the samples at `index` (slice, mask or integer array)."""
-        return type(self)(**{f.name: _pick(getattr(self, f.name), index) for f in fields(self)})
+        return type(self)(**{name: value[index] if isinstance(value, np.ndarray) else value for name, value in vars(self).items()})
 
     @classmethod
     def concatenate(cls, parts):
         """Join `parts` in order; fields that are not arrays are those of the first part."""
         parts = list(parts)
-        return cls(**{f.name: _join([getattr(part, f.name) for part in parts]) for f in fields(cls)})
-
-
-def _pick(value, index):
-    return value[index] if isinstance(value, np.ndarray) else value
-
-
-def _join(values):
-    return np.concatenate(values) if isinstance(values[0], np.ndarray) else values[0]
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) if isinstance(value, np.ndarray) else value
+                      for name, value in vars(parts[0]).items()})
 
 
 class JoinedParts:
@@ -216,12 +209,8 @@ def runs_of(flags: ArrayLike) -> np.ndarray:
 
 def smallest_step(readings: np.ndarray, least: float = 1e-9) -> np.ndarray:
     """Return the smallest step from one reading to the next in each column, (n, k), above the share `least` of the largest, shape (k,)."""
-    return np.array([_smallest_step(column, least) for column in readings.T])
-
-
-def _smallest_step(column, least):
-    step = np.abs(np.diff(column))
-    return np.min(step, where=step > least * max(np.abs(column).max(initial=0.0), 1e-12), initial=np.inf)
+    steps, largest = np.abs(np.diff(readings, axis=0)), np.abs(readings).max(axis=0, initial=1e-12)
+    return np.min(steps, axis=0, where=steps > least * largest, initial=np.inf)
 
 
 def rounding_variance(readings: np.ndarray) -> np.ndarray:

@@ -65,9 +65,9 @@ def for_people(unit: str, quantity: str = '') -> tuple[float, str]:
     return next((_SHOWN[kind][unit] for kind in kinds if unit in _SHOWN.get(kind, {})), (1.0, unit))
 
 
-def decimals(sd: float, digits: int = 2) -> int:
-    """Return the number of decimals that shows `digits` digits of a standard deviation."""
-    return int(max(0, min(12, digits - 1 - np.floor(np.log10(sd) + 1e-9))))
+def decimals(sd: float) -> int:
+    """Return the number of decimals that shows two digits of a standard deviation."""
+    return int(max(0, min(12, 1 - np.floor(np.log10(sd) + 1e-9))))
 
 
 def with_sd(value: float, sd: float) -> tuple[str, str]:

@@ -46,24 +46,20 @@ def _is_text(value):
     return isinstance(value, str)
 
 
+def _is_list_of(kind, length=None):
+    return lambda value: isinstance(value, (list, tuple)) and length in (None, len(value)) and all(map(kind, value))
+
+
 def _is_range(value, kind=_is_number):
-    return isinstance(value, (list, tuple)) and len(value) == 2 and all(map(kind, value)) and value[0] <= value[1]
+    return _is_list_of(kind, 2)(value) and value[0] <= value[1]
 
 
 def _is_temperature_range(value):
     return _is_range(value) and RANGE_C[0] <= value[0] and value[1] <= RANGE_C[1]
 
 
-def _is_triple_of_sizes(value):
-    return isinstance(value, (list, tuple)) and len(value) == 3 and all(map(_is_size, value))
-
-
 def _or_none(kind):
     return lambda value: value is None or kind(value)
-
-
-def _is_list_of(kind):
-    return lambda value: isinstance(value, (list, tuple)) and all(map(kind, value))
 
 
 def _is_direction(value):
@@ -77,7 +73,7 @@ def _is_joint_errors(value):
                                            for name in ('turning', 'zeros', 'angles'))
 
 
-_NOISE = {'noise_sd': _is_triple_of_sizes, 'between_window_sd': _is_size, 'wander_sd': _is_size}
+_NOISE = {'noise_sd': _is_list_of(_is_size, 3), 'between_window_sd': _is_size, 'wander_sd': _is_size}
 _PROOF = {'before': _is_size, 'after': _is_size, 'ci95': lambda value: _is_range(value, _is_size), 'unit': _is_text, 'windows': _is_count}
 
 

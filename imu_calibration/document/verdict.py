@@ -34,13 +34,6 @@ LOST_SHARE = 0.05
 """A warning is issued when more than this share of the samples is lost."""
 
 
-def notes_on(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
-    """Return the notes; arguments as in `verdict.judge`."""
-    remaining = [Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)]
-    return (_worse(calibration) + _unused_rests(calibration) + remaining + _adopted(calibration) + _unexplained(calibration)
-            + _jitter(calibration) + unsteady(calibration, tolerances) + _left_out(calibration) + _lost(calibration))
-
-
 def _worse(calibration):
     return [Reason(WARNING, f'{sensor}: {line}', 'find the cause', key='diagnose', sensors=(sensor,))
             for sensor, entry in calibration.proof.items() for line in worse_regimes(entry)]
@@ -59,22 +52,26 @@ def _unused_rests(calibration):
                    'reduce static_minimum, or increase quiet_ratio', key='setting')]
 
 
+CHANGES = {
+    'added': ('added to the model, because the recording demands it: {}', 'see the evidence; the requested model omits it', 'diagnose'),
+    'denied': ('not added to the model, because parts of the recording disagree, no coefficient is significant or the size is implausible: '
+               '{}; the standard deviations allow for it', 'see the evidence', 'diagnose'),
+    'lacking': ('the motion demands {}, which cannot join the model, since not all of it is kept: the standard deviations allow for it',
+                'calibrate the recording offline', None),
+    'not_believed': ('held, because only the misfit of the model determines them, at an implausible value: {}',
+                     'move the table so that gravity or the rate of turn act along their axes', None)}
+"""Entry of the statistics -> (note with the names, next step, its key) on a change of the model by the recording."""
+
+
 def _adopted(calibration):
     """Return notes on the changes of the model by the recording."""
-    added, unstable = (calibration.statistics.get(name) or [] for name in ('added', 'denied'))
-    notes = [Reason(NOTE, 'added to the model, because the recording demands it: '
-                    f'{", ".join(_with_size(calibration, name) for name in added)}',
-                    'see the evidence; the requested model omits it', key='diagnose')] if added else []
-    notes += [Reason(NOTE, f'not added to the model, because parts of the recording disagree, no coefficient is significant or the size is '
-                    f'implausible: {", ".join(unstable)}; the standard deviations allow for it',
-                     'see the evidence', key='diagnose')] if unstable else []
-    lacking = calibration.statistics.get('lacking') or []
-    notes += [Reason(NOTE, f'the motion demands {", ".join(lacking)}, which cannot join the model, since not all of it is kept: '
-                     'the standard deviations allow for it', 'calibrate the recording offline')] if lacking else []
-    strange = calibration.statistics.get('not_believed') or {}
-    return notes + ([Reason(NOTE, 'held, because only the misfit of the model determines them, at an implausible value: '
-                            f'{_strange(strange)}',
-                            'move the table so that gravity or the rate of turn act along their axes')] if strange else [])
+    names = {change: calibration.statistics.get(change) or [] for change in CHANGES}
+    names['added'] = [_with_size(calibration, name) for name in names['added']]
+    if held := names['not_believed']:
+        names['not_believed'] = [f'{name} ({value:.3g})' for name, value in held.items()][:SHOWN_NAMES]
+        names['not_believed'] += ['...'] * (len(held) > SHOWN_NAMES)
+    return [Reason(NOTE, text.format(', '.join(names[change])), step, key=key)
+            for change, (text, step, key) in CHANGES.items() if names[change]]
 
 
 def _unexplained(calibration):
@@ -94,12 +91,6 @@ def _jitter(calibration):
     found = calibration.statistics.get('stamp_jitter')
     return [Reason(NOTE, f'the stamps have independent errors of {1e6 * found["sd_s"]:.0f} us (1 sd), which explain scatter in motion',
                    "use stamps of the sensor's own clock")] if found else []
-
-
-def _strange(values):
-    """Return names with the values they would have had; of many, the first ones."""
-    shown = ', '.join(f'{name} ({value:.3g})' for name, value in list(values.items())[:SHOWN_NAMES])
-    return shown + (' ...' if len(values) > SHOWN_NAMES else '')
 
 
 def _with_size(calibration, name):
@@ -217,7 +208,10 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     reasons = [_decided(calibration, sensor, word) for sensor, word in decisions.items()]
     reasons.append(_parameters(calibration, within, limiting, complete=within == len(found) and set(decisions.values()) == {HELPS}))
     reasons += _undetermined(calibration) + _blind(calibration) + _implausible(calibration) + misfits(calibration)
-    return Verdict(decisions, (*reasons, *_strange_causes(calibration), *notes_on(calibration, tolerances)), within, len(found), limiting)
+    reasons += _strange_causes(calibration) + _worse(calibration) + _unused_rests(calibration)
+    reasons += [Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)]
+    reasons += _adopted(calibration) + _unexplained(calibration) + _jitter(calibration) + unsteady(calibration, tolerances)
+    return Verdict(decisions, (*reasons, *_left_out(calibration), *_lost(calibration)), within, len(found), limiting)
 
 
 def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:

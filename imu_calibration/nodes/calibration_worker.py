@@ -16,7 +16,6 @@ from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SolvePacer
 from imu_calibration.core.errors import ImuCalibrationError, NotObservableError, shortened
-from imu_calibration.core.progress import LiveState
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.trust import missing
 from imu_calibration.nodes.calibration_status import WorkerState
@@ -275,7 +274,9 @@ class CalibrationWorker(threading.Thread):
                      'calibrate the recording offline']
         stale = self.state.solution != self._n_solutions or self.state.groups == [] or result is None
         groups = self.live.groups() if stale else self.state.groups
-        diagnosis = self._diagnosis_state() if self.live.on_table is not None else None
+        found = self._diagnosis.state
+        diagnosis = None if self.live.on_table is None else replace(
+            found, values={**found.values, 'diagnoses': self._diagnosis.n_answers, 'being made': self._diagnosis.is_running})
         self.state = WorkerState(groups, self._watch.state(self._looked), self._n_solutions, verdict, tuple(lines), self._trouble,
                                  tuple(line for line in self._faults.values() if line), self.live.n_windows, values,
                                  self.live.status(self.hints), diagnosis, judged, complete)
@@ -286,7 +287,3 @@ class CalibrationWorker(threading.Thread):
         if seen != self._covered:
             self._covered = seen
             self.listeners.coverage(replace(self.live.coverage(), done=all_determined(self.state.groups)))
-
-    def _diagnosis_state(self) -> LiveState:
-        state = self._diagnosis.state
-        return replace(state, values={**state.values, 'diagnoses': self._diagnosis.n_answers, 'being made': self._diagnosis.is_running})

@@ -8,7 +8,7 @@ from typing import Any
 from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from imu_calibration.nodes.lifecycle import every
@@ -19,21 +19,17 @@ QUEUE_DEPTH = 1000
 
 def input_qos(reliable: bool = False, depth: int = QUEUE_DEPTH) -> QoSProfile:
     """Return the profile of an input (`inputs.MatchedInput`): `reliable` repeats lost messages, best effort accepts any publisher."""
-    return _last(depth, ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
 
 
 def output_qos(depth: int = QUEUE_DEPTH) -> QoSProfile:
-    """Return the profile of an output: reliable, so that every subscriber connects."""
-    return _last(depth, ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE)
+    """Return the profile of an output: that of rclpy, which is reliable, so that every subscriber connects."""
+    return QoSProfile(depth=depth)
 
 
-def latched_qos() -> QoSProfile:
-    """Return the profile of the calibration document: a late subscriber receives the last one."""
-    return _last(1, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-def _last(depth: int, reliability: ReliabilityPolicy, durability: DurabilityPolicy) -> QoSProfile:
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability)
+def latched_qos(depth: int = 1) -> QoSProfile:
+    """Return the profile of the calibration document: a late subscriber receives the last messages."""
+    return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 PUBLISHER_CHECK_SECONDS = 0.25

@@ -101,7 +101,8 @@ def _drain(context, source, publisher, convert):
     guard = SignalHandlerGuardCondition(context)
     try:
         with publisher.handle, guard.handle, context.handle:
-            wait_set, publish = _inner.WaitSet(1, 1, 0, 0, 0, 0, context.handle), _publish_raw(publisher)
+            wait_set = _inner.WaitSet(1, 1, 0, 0, 0, 0, context.handle)
+            publish = getattr(publisher.handle, 'publish_raw', publisher.publish)
             while context.ok():
                 try:
                     _drain_one(context, source, wait_set, guard, publish, convert)
@@ -128,8 +129,3 @@ def _drain_one(context, source, wait_set, guard, publish, convert):
                 converted = convert(taken[0], taken[1])
                 if converted is not None:
                     publish(converted)
-
-
-def _publish_raw(publisher):
-    handle = publisher.handle
-    return handle.publish_raw if hasattr(handle, 'publish_raw') else publisher.publish

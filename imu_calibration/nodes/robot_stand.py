@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
@@ -69,8 +69,7 @@ class StaticFrames:
             except ImportError as error:
                 raise InputError(f'{TF_STATIC} needs the messages of the package tf2_msgs, which is not installed; '
                                  'install ros-jazzy-tf2-msgs, or give target_xyz and target_rpy', code='package_missing') from error
-            qos = QoSProfile(depth=TRANSFORM_DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            self._subscription = self._node.create_subscription(TFMessage, TF_STATIC, self.take, qos)
+            self._subscription = self._node.create_subscription(TFMessage, TF_STATIC, self.take, latched_qos(TRANSFORM_DEPTH))
 
 
 URDF_FROM_TOPIC = 'topic'

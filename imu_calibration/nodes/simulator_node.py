@@ -10,6 +10,7 @@ import queue
 import sys
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -175,7 +176,8 @@ class SimulatorNode(Node):
             yield self._batch(self._simulation.take(until), until)
 
     def _batch(self, block, until):
-        parts = [(self._to['imu/data_raw'], block.imu, encode_imu), (self._to['joint_states'], block.joints, self._encode_joints)]
+        encode = partial(encode_joints, with_velocity=self.settings.velocity)
+        parts = [(self._to['imu/data_raw'], block.imu, encode_imu), (self._to['joint_states'], block.joints, encode)]
         if 'imu/temperature' in self._to:
             parts.append((self._to['imu/temperature'], block.temperature, encode_temperature))
         if 'imu/truth' in self._to:
@@ -185,9 +187,6 @@ class SimulatorNode(Node):
         messages = [message for _, samples, encode in parts if len(samples) for message in rows(encode(samples))]
         order = np.argsort(due, kind='stable')
         return Batch(due[order], [publishers[k] for k in order], [messages[k] for k in order], until)
-
-    def _encode_joints(self, joints):
-        return encode_joints(joints, with_velocity=self.settings.velocity)
 
     def _take_over(self, now, message):
         try:

@@ -14,7 +14,7 @@ from imu_calibration.core.settings import setting
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import HELD, tolerances_of
-from imu_calibration.kinematics.motion_limits import MotionLimits, limits_of
+from imu_calibration.kinematics.motion_limits import MotionLimits
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.coordinates import Cause, Coordinates, ToldApart
 from imu_calibration.planning.motion_library import MotionLibrary
@@ -69,10 +69,13 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
         if (sensor, name) not in model.slices:
             model = model.with_effect(sensor, name)
     for key in causes:
-        _require_shown_by_motion(model, key)
+        effect = model.catalogue.find(*key, model.joint_names)
+        if special(effect) or effect.smooth or 'temperature' in effect.needs:
+            raise InputError(f"effects that motion separates must depend on it, '{key[1]}' depends on time, temperature or range; "
+                             'omit it')
     values = model.start_from(calibration.model, calibration.values)
     coordinates = Coordinates(model, tolerances_of(model, options.tolerances), values)
-    problem = PlanningProblem(MotionLibrary(table, limits or limits_of(table)), coordinates, dict(noise), rate=rate)
+    problem = PlanningProblem(MotionLibrary(table, limits), coordinates, dict(noise), rate=rate)
     questions = len(model.catalogue.effects(model.joint_names))
     problem.goal = ToldApart(coordinates, suspected(problem, causes, table, sizes=sizes or {}), questions)
     names = {name: k for k, name in enumerate(calibration.param_names) if k not in _indices(calibration.model, first)}
@@ -122,12 +125,6 @@ def _indices(model, key):
 
 def _places(coordinates, key):
     return np.array([int(np.argmax(np.abs(coordinates.basis[k]))) for k in _indices(coordinates.model, key)])
-
-
-def _require_shown_by_motion(model, key):
-    effect = model.catalogue.find(*key, model.joint_names)
-    if special(effect) or effect.smooth or 'temperature' in effect.needs:
-        raise InputError(f"effects that motion separates must depend on it, '{key[1]}' depends on time, temperature or range; omit it")
 
 
 TIME_OVER = 'the time given is over'

@@ -14,7 +14,7 @@ from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint import Joint, JointLimits
 from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
-from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
+from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints, limits_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, Segment
 
@@ -201,12 +201,13 @@ class MotionLibrary:
     Parameters
     ----------
     table : Table
-    limits : MotionLimits
+    limits : MotionLimits, optional
+        Default: the limits of the table.
 
     """
 
-    def __init__(self, table: Table, limits: MotionLimits):
-        self.table = table
+    def __init__(self, table: Table, limits: MotionLimits | None = None):
+        self.table, limits = table, limits or limits_of(table)
         self.limits = MotionLimits(limits.lower, limits.upper, LIMIT_SHARE * limits.speed, LIMIT_SHARE * limits.acceleration, limits.turns)
         self.names = tuple(table.joint_names)
         self.spread = choose_places(table, self.limits)

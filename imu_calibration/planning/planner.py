@@ -341,7 +341,7 @@ def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: d
     coordinates = Coordinates(model, tolerances_of(model, tolerances or options.tolerances), values)
     step = table.joint_noise_rad or 0.0
     beside = {sensor: replace(own, reference=ReferenceNoise.of_steps(step, sensor)) for sensor, own in noise.items()}
-    planner = Planner(PlanningProblem(MotionLibrary(table, limits or limits_of(table)), coordinates, beside, rate=rate))
+    planner = Planner(PlanningProblem(MotionLibrary(table, limits), coordinates, beside, rate=rate))
     if calibration is not None:
         planner.take(calibration)
     return planner

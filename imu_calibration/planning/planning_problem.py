@@ -54,14 +54,13 @@ class PlanningProblem:
         Sensor -> NoiseModel of single samples.
     rate : float
         Samples per second.
-    known : ndarray, optional
-        Information about z of an earlier calibration, in addition to the prior.
 
     """
 
-    def __init__(self, library: MotionLibrary, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float = 100.0,
-                 known: np.ndarray | None = None):
-        self.library, self.coordinates, self.noise, self.rate, self.known = library, coordinates, noise, rate, known
+    def __init__(self, library: MotionLibrary, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float = 100.0):
+        self.library, self.coordinates, self.noise, self.rate = library, coordinates, noise, rate
+        self.known: np.ndarray | None = None
+        """Information about z of an earlier calibration, in addition to the prior."""
         self.goal: Goal = WithinTolerances(coordinates)
         self.predictor = WindowPredictor(library.table, coordinates, noise, rate=rate)
 

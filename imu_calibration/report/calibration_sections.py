@@ -36,11 +36,11 @@ def observability_section(result: CalibrationResult) -> dict[str, Any]:
     return {**figures, 'strongest': strongest(calibration, live)}
 
 
-def strongest(calibration: Calibration, live: np.ndarray, count: int = 5) -> list[tuple[str, str, float]]:
-    """Return the strongest correlations as (name, name, value)."""
+def strongest(calibration: Calibration, live: np.ndarray) -> list[tuple[str, str, float]]:
+    """Return the five strongest correlations as (name, name, value)."""
     correlation, names = _correlation(calibration, live)
     rows, columns = np.triu_indices(len(names), 1)
-    order = np.argsort(-np.abs(correlation[rows, columns]), kind='stable')[:count]
+    order = np.argsort(-np.abs(correlation[rows, columns]), kind='stable')[:5]
     return [(names[rows[k]], names[columns[k]], correlation[rows[k], columns[k]]) for k in order]
 
 

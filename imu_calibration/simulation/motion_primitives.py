@@ -58,11 +58,10 @@ def two_axes(builder: MotionBuilder, at_deg: Sequence[float], rates_deg: ArrayLi
     builder.spin(np.multiply.outer((1, -1), rates_deg), dwell)
 
 
-def tumble(builder: MotionBuilder, amplitude_deg: ArrayLike, frequency: ArrayLike, *, phase: ArrayLike,
-           duration: float) -> None:
+def tumble(builder: MotionBuilder, amplitude_deg: ArrayLike, frequency: ArrayLike, *, duration: float) -> None:
     """Swing all joints at once from zero."""
     builder.move([0, 0, 0])
-    builder.oscillate(amplitude_deg, frequency, duration, phase=phase, fade=2.0)
+    builder.oscillate(amplitude_deg, frequency, duration, phase=[0.3, 1.1, 2.0], fade=2.0)
 
 
 def rest_at_zero(builder: MotionBuilder, dwell: float) -> None:
@@ -106,11 +105,11 @@ EQUAL_ANGLES_DEG = np.arange(0.0, 401.0, 10.0)
 """Avrutov 2017, samples 1 and 2: the 41 equal angles (40 according to the paper)."""
 
 
-def _table(axes, up=(0.0, 0.0, 1.0), latitude=50.45, height=170.0, rpy_deg=(0.0, 0.0, 0.0)):
+def _table(axes, up=(0.0, 0.0, 1.0), latitude=50.45, rpy_deg=(0.0, 0.0, 0.0)):
     names = ('outer', 'middle', 'inner') if len(axes) == 3 else ('turn',)
     joints = [{'name': name, 'axis': list(axis)} for name, axis in zip(names, axes, strict=True)]
     mount = {'rpy_deg': list(rpy_deg), 'xyz': None}
-    return {'joints': joints, 'up': list(up), 'latitude': latitude, 'height': height, 'azimuth_deg': 0.0, 'mount': mount}
+    return {'joints': joints, 'up': list(up), 'latitude': latitude, 'height': 170.0, 'azimuth_deg': 0.0, 'mount': mount}
 
 
 GIMBALS = _table([AXIS_VECTORS[axis] for axis in 'ZYX'])

@@ -254,15 +254,15 @@ def _thermal(builder, _rng):
 def _navigation(builder, _rng):
     """Rest, 50 s of slow tumbling, rest, 50 s of livelier motion: for dead reckoning from either rest."""
     builder.rest(10.0)
-    motion_primitives.tumble(builder, [70.0, 50.0, 60.0], [0.11, 0.17, 0.13], phase=[0.3, 1.1, 2.0], duration=50.0)
+    motion_primitives.tumble(builder, [70.0, 50.0, 60.0], [0.11, 0.17, 0.13], duration=50.0)
     builder.rest(10.0)
-    motion_primitives.tumble(builder, [40.0, 25.0, 20.0], [0.31, 0.53, 0.71], phase=[0.3, 1.1, 2.0], duration=50.0)
+    motion_primitives.tumble(builder, [40.0, 25.0, 20.0], [0.31, 0.53, 0.71], duration=50.0)
     builder.rest(5.0)
 
 
 def _tumbling(builder, _rng):
     builder.rest(5.0)
-    motion_primitives.tumble(builder, [60.0, 45.0, 30.0], [0.7, 0.9, 1.1], phase=[0.3, 1.1, 2.0], duration=60.0)
+    motion_primitives.tumble(builder, [60.0, 45.0, 30.0], [0.7, 0.9, 1.1], duration=60.0)
     builder.rest(5.0)
 
 

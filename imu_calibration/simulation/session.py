@@ -142,7 +142,10 @@ def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: P
     stamps = jitter_stamps(SESSION_START_NS + np.round(time * 1e9).astype(np.int64), options.noise.stamp_jitter, rng)
     imu = ImuSamples(stamps, force, rate, options.frame_id)
     joints = joint_samples(profile.at((np.arange(n_joint) + 0.5) / options.joint_rate), table, options, start_ns=SESSION_START_NS, rng=rng)
-    return imu, joints, _temperature_topic(profile, options)
+    if options.temperature_start_c is None:
+        return imu, joints, None
+    time = np.arange(0.0, profile.duration, 1.0)
+    return imu, joints, TemperatureSamples(SESSION_START_NS + np.round(time * 1e9).astype(np.int64), temperature_at(time, options))
 
 
 def joint_samples(motion: JointMotion, table: Table, options: SimulationOptions, *, start_ns: int,
@@ -164,11 +167,13 @@ def _outputs(model, values, table, profile, time, options):
 def answered(model: SensorModel, values: np.ndarray, table: Table, *, motion: JointMotion, time: np.ndarray,
              options: SimulationOptions) -> tuple[np.ndarray, np.ndarray]:
     """Return the outputs of the sensors without noise, each (n, 3): motion, warm-up, and a machine if biases depend on vibration."""
-    motion, hum = replace(motion, thermal_branch=branch_at(time, options)), 0.0
+    warmth, hum = temperature_at(time, options), 0.0
+    if warmth is not None:   # it never turns (`kinematics.signal_history`)
+        motion = replace(motion, thermal_branch=np.clip((warmth - options.temperature_start_c) / HALF_WIDTH, -1.0, 1.0))
     if model.uses('vibration'):
         hum, variance = hum_and_variance(time, options.imu_rate)
         motion = replace(motion, vibration=variance)
-    force, rate = predict(model, values, table, motion=motion, temperature_c=temperature_at(time, options))
+    force, rate = predict(model, values, table, motion=motion, temperature_c=warmth)
     return force + hum, rate
 
 
@@ -177,19 +182,6 @@ def temperature_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray |
     if options.temperature_start_c is None:
         return None
     return options.temperature_start_c + options.temperature_rise_c * (1 - np.exp(-time / options.temperature_time))
-
-
-def branch_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray | None:
-    """Return the thermal branch of the warm-up (`kinematics.signal_history`), or None without a temperature topic: it never turns."""
-    warmth = temperature_at(time, options)
-    return None if warmth is None else np.clip((warmth - options.temperature_start_c) / HALF_WIDTH, -1.0, 1.0)
-
-
-def _temperature_topic(profile, options):
-    if options.temperature_start_c is None:
-        return None
-    time = np.arange(0.0, profile.duration, 1.0)
-    return TemperatureSamples(SESSION_START_NS + np.round(time * 1e9).astype(np.int64), temperature_at(time, options))
 
 
 BIAS_TIME = 100.0

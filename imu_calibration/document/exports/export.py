@@ -115,13 +115,8 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
             raise InputError(f'for {target.title} there must be {lacks} and there is none; give a noise document', key='noise',
                              code='noise_missing')
         return None, [f'the noise figures are left out: there must be {lacks} from a noise document']
-    return target.noise(found), _walk_lines(found) if target.needs_walk else []
-
-
-def _walk_lines(noise: Noise) -> list[str]:
-    """Describe random walks that are equivalents or bounds."""
-    basis = {sensor: getattr(noise, sensor).basis for sensor in SENSORS}
-    return [f'random walk of the {sensor}: {BASIS[found]}' for sensor, found in basis.items() if found != 'walk']
+    bases = {sensor: getattr(found, sensor).basis for sensor in SENSORS if target.needs_walk}
+    return target.noise(found), [f'random walk of the {sensor}: {BASIS[basis]}' for sensor, basis in bases.items() if basis != 'walk']
 
 
 def _noise_of(calibration, figures, rate) -> Noise | None:
@@ -174,7 +169,8 @@ def loss_lines(target: Target, loss: Loss) -> list[str]:
                 f'fed with raw readings it is left with an error of rms {left}{beside}, on {loss.motion}']
     lines = []
     if loss.estimated:
-        lines.append('not written, because the target estimates it while it runs: ' + _names(loss.estimated))
+        lines.append('not written, because the target estimates it while it runs: '
+                     + ', '.join(f'{effect.sensor} {effect.name}' for effect in loss.estimated))
     if loss.nothing:
         return [*lines, 'lost: nothing']
     for lost in loss.effects:
@@ -185,10 +181,6 @@ def loss_lines(target: Target, loss: Loss) -> list[str]:
         left = f'{left} rms' if loss.left[sensor] > ROUNDING_LOSS else 'none'
         lines.append(f'remaining error of the {sensor}: {left} (raw readings: {raw}), on {loss.motion}')
     return lines
-
-
-def _names(effects) -> str:
-    return ', '.join(f'{effect.sensor} {effect.name}' for effect in effects)
 
 
 def holds_in_words(target: Target) -> str:

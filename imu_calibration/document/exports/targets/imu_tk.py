@@ -45,14 +45,11 @@ def _numbers(content):
         values = [float(word) for word in words]
     except ValueError:
         values = []
-    if len(values) != COUNT or not np.all(np.isfinite(values)) or not _invertible(values):
+    if len(values) != COUNT or not np.all(np.isfinite(values)) or not all(
+            abs(np.linalg.det(np.reshape(part, (3, 3)))) > 0 for part in (values[:9], values[9:18])):
         raise InputError(f'an imu_tk file must have {COUNT} numbers, misalignment and scale matrices that can be inverted and a bias, got '
                          f'{len(words)} entries; give a different file')
     return values
-
-
-def _invertible(values):
-    return all(abs(np.linalg.det(np.reshape(part, (3, 3)))) > 0 for part in (values[:9], values[9:18]))
 
 
 TARGETS = (Target(
