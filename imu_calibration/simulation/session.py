@@ -142,10 +142,10 @@ def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: P
     stamps = jitter_stamps(SESSION_START_NS + np.round(time * 1e9).astype(np.int64), options.noise.stamp_jitter, rng)
     imu = ImuSamples(stamps, force, rate, options.frame_id)
     joints = joint_samples(profile.at((np.arange(n_joint) + 0.5) / options.joint_rate), table, options, start_ns=SESSION_START_NS, rng=rng)
-    if options.temperature_start_c is None:
-        return imu, joints, None
-    time = np.arange(0.0, profile.duration, 1.0)
-    return imu, joints, TemperatureSamples(SESSION_START_NS + np.round(time * 1e9).astype(np.int64), temperature_at(time, options))
+    seconds = np.arange(0, profile.duration)
+    warmth = temperature_at(seconds, options)
+    stamp_ns = SESSION_START_NS + seconds.astype(np.int64) * 1_000_000_000
+    return imu, joints, None if warmth is None else TemperatureSamples(stamp_ns, warmth)
 
 
 def joint_samples(motion: JointMotion, table: Table, options: SimulationOptions, *, start_ns: int,
