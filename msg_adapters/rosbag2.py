@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from os import PathLike
 from pathlib import Path, PurePath
@@ -174,11 +175,8 @@ class Rosbag2:
                 for entry in self.metadata.get('topics_with_message_count', ())}
 
     def _counts(self):
-        announced = self._announced()
-        if announced:
-            return {name: announced.get(name, 0) for name in self.types}
-        counted = [file.count() for file in self.files]
-        return {name: sum(counts.get(name, 0) for counts in counted) for name in self.types}
+        counts = self._announced() or sum((Counter(file.count()) for file in self.files), Counter())
+        return {name: counts.get(name, 0) for name in self.types}
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:

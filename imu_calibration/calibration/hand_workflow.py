@@ -20,7 +20,7 @@ from imu_calibration.calibration.hand_proof import (
 )
 from imu_calibration.calibration.result import GRAVITY_SD, CalibrationResult, ErrorBudget, WindowErrors
 from imu_calibration.calibration.table_calibration import CheckResult
-from imu_calibration.compensation.stream import compensate_readings
+from imu_calibration.compensation.stream import compensate_samples
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, JoinedParts, NominalScaling, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
@@ -256,7 +256,7 @@ def check_by_hand(source: Callable, calibration: Calibration, options: Calibrati
         return CheckResult({}, preflight.findings, str(error))
     check_force(float(np.median(np.linalg.norm(data.poses.force, axis=1))))
     warm = None if recording.temperature_c is None else TemperatureSamples(recording.imu.stamp_ns, recording.temperature_c)
-    corrected = compensate_readings(calibration, recording.imu, temperature_c=warm)
+    corrected = compensate_samples(calibration, recording.imu, warm)
     return CheckResult(prove_readings(data, recording.imu, corrected, gravity=gravity_of(calibration, options)), preflight.findings)
 
 

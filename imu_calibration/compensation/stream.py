@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -187,21 +187,10 @@ Vectors = Sequence[Sequence[float]] | np.ndarray
 Temperatures = Sequence[float] | np.ndarray | TemperatureSamples | float
 
 
-@overload
-def compensate_readings(calibration: FittedErrors, samples: ImuSamples, rate_s: None = None, *, time: None = None,
-                        temperature_c: Temperatures | None = None) -> ImuSamples: ...
-
-
-@overload
-def compensate_readings(calibration: FittedErrors, samples: Vectors, rate_s: Vectors | None = None, *,
-                        time: Sequence[float] | np.ndarray | None = None,
-                        temperature_c: Temperatures | None = None) -> tuple[np.ndarray, np.ndarray]: ...
-
-
-@overload
-def compensate_readings(calibration: FittedErrors, samples: Vectors | ImuSamples, rate_s: Vectors | None = None, *,
-                        time: Sequence[float] | np.ndarray | None = None,
-                        temperature_c: Temperatures | None = None) -> tuple[np.ndarray, np.ndarray] | ImuSamples: ...
+def compensate_samples(calibration: FittedErrors, imu: ImuSamples, temperature_c: Temperatures | None = None) -> ImuSamples:
+    """Return samples without the calibrated errors; as `compensate_readings`."""
+    corrected = CompensationStream(calibration, _as_temperatures(temperature_c, imu.stamp_ns)).correct(imu)
+    return ImuSamples(imu.stamp_ns, corrected.force, corrected.rate, imu.frame_id)
 
 
 def compensate_readings(calibration: FittedErrors, samples: Vectors | ImuSamples, rate_s: Vectors | None = None, *,
@@ -233,12 +222,10 @@ def compensate_readings(calibration: FittedErrors, samples: Vectors | ImuSamples
         When shapes do not fit, or times or temperatures are missing that the calibration needs.
 
     """
-    imu = samples if isinstance(samples, ImuSamples) else _as_samples(calibration, samples, rate_s, time)
-    stream = CompensationStream(calibration, temperature=_as_temperatures(temperature_c, imu.stamp_ns))
-    corrected = stream.correct(imu)
     if isinstance(samples, ImuSamples):
-        return ImuSamples(imu.stamp_ns, corrected.force, corrected.rate, imu.frame_id)
-    return corrected.force, corrected.rate
+        return compensate_samples(calibration, samples, temperature_c)
+    found = compensate_samples(calibration, _as_samples(calibration, samples, rate_s, time), temperature_c)
+    return found.force_s, found.rate_s
 
 
 def _as_samples(calibration, force_s, rate_s, time):

@@ -15,7 +15,7 @@ from imu_calibration.preprocessing.checks import refuse, span_words
 from imu_calibration.preprocessing.on_table import MIN_MATCH, TESTED_RATE, exchanged, find_exchange, match_axes, same_motion, signs_or_delay
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
 from imu_calibration.preprocessing.scan import MIN_TURN_RATE
-from imu_calibration.preprocessing.value_checks import force_error
+from imu_calibration.preprocessing.value_checks import force_error, wrong_rate_unit
 from imu_calibration.preprocessing.window import Window
 
 LASTING = 1.0
@@ -201,17 +201,15 @@ def _rate_units(moments):
     if not ratio > 0:
         return
     if 40 < ratio < 80:
-        yield CheckFinding('rate_unit', REFUSE,
-                           f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: probably deg/s, '
-                           'gyroscope_scale 57.29578; convert them in the driver', key='nominal')
+        yield wrong_rate_unit(f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: probably deg/s, '
+                              'gyroscope_scale 57.29578; convert them in the driver')
     elif 1 / 80 < ratio < 1 / 40:
         yield CheckFinding('rate_unit', REFUSE,
                            f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: probably '
                       'degrees; convert them in the driver of the table')
     elif not 0.5 < ratio < 2.0 and np.linalg.norm(cross)**2 > RELATED * np.trace(measured) * np.trace(reference) / 3:
-        yield CheckFinding('rate_unit', REFUSE,
-                           f'angular rates must be in rad/s, they are {ratio:.4g} times the rates of the joints: counts or volts?; '
-                      'convert them in the driver', key='nominal')
+        yield wrong_rate_unit(f'angular rates must be in rad/s, they are {ratio:.4g} times the rates of the joints: counts or volts?; '
+                              'convert them in the driver')
 
 
 def _axes(sensor, moments, table, windows):

@@ -59,9 +59,9 @@ def force_error(length: float, where: str = 'at rest') -> InputError | None:
     return None
 
 
-def _unit(check, text):
-    """Return the refusal of a unit that a nominal scaling would put right."""
-    return CheckFinding(check, REFUSE, text, key='nominal')
+def wrong_rate_unit(text: str) -> CheckFinding:
+    """Return the refusal of rates in a unit that a nominal scaling would put right."""
+    return CheckFinding('rate_unit', REFUSE, text, key='nominal')
 
 
 def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -73,20 +73,19 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         ratio = 1.0 / turning.factor
         came = f'angular rates must be in rad/s, they are {significant(ratio)} times the rotation of the measured gravity: '
         if 0.6 < ratio * DEG < 1.6:
-            yield _unit('rate_unit',
-                        f'{came}probably deg/s, gyroscope_scale 57.29578; {convert}')
+            yield wrong_rate_unit(f'{came}probably deg/s, gyroscope_scale 57.29578; {convert}')
         elif 0.6 < ratio / DEG < 1.6:
-            yield _unit('rate_unit', f'{came}probably converted from deg/s twice, gyroscope_scale 0.01745329; convert them once')
+            yield wrong_rate_unit(f'{came}probably converted from deg/s twice, gyroscope_scale 0.01745329; convert them once')
         elif _full_scale(evidence) is not None:
             return
         elif not 0.5 < ratio < 2.0:
-            yield _unit('rate_unit', f'{came}counts or volts?; {convert}')
+            yield wrong_rate_unit(f'{came}counts or volts?; {convert}')
         else:
             yield CheckFinding('rate_unit', GOOD, f'angular rate in rad/s: gravity rotates according to the rates{_about(turning.axes)}')
     elif largest > MAX_GYRO_RATE:
         unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
-        yield _unit('rate_unit', f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
-                                 f'{convert}')
+        yield wrong_rate_unit(f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
+                              f'{convert}')
 
 
 def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:

@@ -3,8 +3,6 @@
 from os import PathLike
 from pathlib import Path
 
-import numpy as np
-
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
@@ -66,11 +64,9 @@ def _motion(calibration, bag, stand, topics) -> TrialMotion:
         return recorded_motion(calibration, ImuSamples.concatenate(blocks), temperature, name=name_of(bag))
     table = table_of(stand, [bag], topics)
     truth = session_truth(source_of(bag, topics, table.joint_names)(), table)
-    ref = truth.reference
-    count = len(ref.time)
-    warmth = temperature_at(calibration, temperature, np.asarray(truth.imu.stamp_ns))
+    ref, warmth = truth.reference, temperature_at(calibration, temperature, truth.imu.stamp_ns)
     return motion_of(ref.force_s, ref.rate_s, ref.alpha_s, temperature_c=warmth,
-                     text=f'{name_of(bag)}, moved as its table says ({count} samples)')
+                     text=f'{name_of(bag)}, moved as its table says ({len(truth.imu)} samples)')
 
 
 def import_calibration(path: str | PathLike, source: str, *, output: str | PathLike | None = None, frame_id: str = '') -> Calibration:
