@@ -295,8 +295,7 @@ def _choose(path, topics, message_type, asked, required, lenient=False):
         names = [name for name in (asked, '/' + asked.lstrip('/')) if name in fitting]
         if not names:
             raise InputError(f'the topic that is read must be a {message_type} topic of {path}, got {asked}'
-                             f'{did_you_mean(asked, fitting)}; {_listing(topics, fitting)}',
-                             key=key, code='topic_unknown')
+                             f'{did_you_mean(asked, fitting)}; {_listing(topics, fitting)}', key=key, code='topic_unknown')
         return names[0]
     if DEFAULT_TOPICS[message_type] in fitting:
         return DEFAULT_TOPICS[message_type]

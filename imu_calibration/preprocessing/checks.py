@@ -30,15 +30,13 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         noisy = evidence.quiet_range[part] > 0
         constant = evidence.n_changed[part] == 0
         if constant.all():
-            yield CheckFinding('frozen', REFUSE,
-                               f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} samples; '
-                          'check the sensor and its driver')
+            yield CheckFinding('frozen', REFUSE, f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} '
+                               'samples; check the sensor and its driver')
             continue
         for axis in np.flatnonzero(constant):
             if noisy.any():
-                yield CheckFinding('frozen', REFUSE,
-                                   f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the remaining axes do; '
-                              'check the sensor and its driver')
+                yield CheckFinding('frozen', REFUSE, f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the '
+                                   'remaining axes do; check the sensor and its driver')
         for axis in np.flatnonzero(~constant):
             moving = np.delete(range_[:, part], axis, axis=1) > MIN_MOVING_STEPS * np.delete(evidence.resolution[part], axis)
             same = (range_[:, part][:, axis] == 0) & ~_at_end(chunks.mean[:, part][:, axis], evidence.ends[part][axis])
@@ -110,13 +108,11 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         total = found.count + sum(count for reason, count in found.dropped.items() if reason not in ('clock reset', 'spike'))
         if found.count < 0.1 * total:
             reasons = ', '.join(f'{count} {reason}' for reason, count in found.dropped.items())
-            yield CheckFinding('stamps', REFUSE,
-                               f'{MESSAGES[name]} must hold finite samples whose header stamps advance, of {total} only {found.count} do '
-                          f'({reasons}); correct the driver and record again')
+            yield CheckFinding('stamps', REFUSE, f'{MESSAGES[name]} must hold finite samples whose header stamps advance, of {total} '
+                               f'only {found.count} do ({reasons}); correct the driver and record again')
             continue
         if found.unstamped:
-            yield CheckFinding('stamps', WARNING,
-                               f'{MESSAGES[name]}: {found.unstamped} of {total} stamps are zero: the time of arrival '
+            yield CheckFinding('stamps', WARNING, f'{MESSAGES[name]}: {found.unstamped} of {total} stamps are zero: the time of arrival '
                                'is used; the driver should stamp each sample at its measurement')
         for reason, count in found.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
@@ -140,8 +136,8 @@ def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         found = stream.statistics
         if found.n_gaps:
             severity = WARNING if found.gap_total > GAP_SHARE * found.duration else NOTE
-            yield CheckFinding('gaps', severity, f'{name}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s of '
-                               f'{found.duration:.0f} s, the longest {found.longest_step:.2f} s; motion within a gap is not used')
+            yield CheckFinding('gaps', severity, f'{name}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s '
+                               f'of {found.duration:.0f} s, the longest {found.longest_step:.2f} s; motion within a gap is not used')
 
 
 def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -149,9 +145,9 @@ def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     for name, stream in _fast_streams(evidence):
         nominal, real = stream.statistics.rate, stream.real_rate
         if nominal and abs(real / nominal - 1) > RATE_SHARE:
-            yield CheckFinding('sampling', WARNING,
-                               f'{name}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is {real:.2f} Hz: '
-                               'samples were lost, or stamps are made when messages arrive; check the driver and the load of the recorder')
+            yield CheckFinding('sampling', WARNING, f'{name}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is '
+                               f'{real:.2f} Hz: samples were lost, or stamps are made when messages arrive; check the driver and the '
+                               'load of the recorder')
         elif nominal:
             yield CheckFinding('sampling', GOOD, f'{name}: {real:.2f} Hz, as the steps between stamps promise')
 
@@ -183,12 +179,12 @@ def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     late = (joints.first_ns - imu.first_ns) * 1e-9
     if overlap <= 0 and shorter > 0:
         yield CheckFinding('clocks', REFUSE, f'Imu and JointState must be stamped by one clock, the joints begin {abs(late):.6g} s '
-                      f'{"after" if late > 0 else "before"} the Imu and they never overlap; '
-                      'synchronise the clocks or stamp both on one computer')
+                           f'{"after" if late > 0 else "before"} the Imu and they never overlap; synchronise the clocks or stamp both on '
+                           'one computer')
     elif overlap < 0.9 * shorter:
-        yield CheckFinding('clocks', WARNING,
-                           f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin {abs(late):.1f} s '
-                      f'{"after" if late > 0 else "before"} the Imu: only the overlap is used; are both stamped by one clock?')
+        yield CheckFinding('clocks', WARNING, f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin '
+                           f'{abs(late):.1f} s {"after" if late > 0 else "before"} the Imu: only the overlap is used; are both stamped '
+                           'by one clock?')
 
 
 CHECKS = (

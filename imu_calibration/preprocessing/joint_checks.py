@@ -61,15 +61,13 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
                     if window.time[stop - 1] - window.time[start] >= LASTING and turns[start:stop].mean() > 0.5
                     and not _rounded(window.rate_s[start], rate[start:stop], bias, step))
     if spans:
-        return CheckFinding('frozen', REFUSE, 'the gyroscope must measure all the time, '
-                            f'it repeats one reading {span_words(spans)} while the joints turn; '
-                            'check the sensor and its driver, and exclude that time')
+        return CheckFinding('frozen', REFUSE, f'the gyroscope must measure all the time, it repeats one reading {span_words(spans)} '
+                            'while the joints turn; check the sensor and its driver, and exclude that time')
     for k, name in enumerate(table.joint_names):
         spans = _joined(span for window, rate in zip(windows, expected) for span in _frozen(window, table, rate + bias, joint=k))
         if spans:
-            return CheckFinding('frozen', REFUSE, 'joint states must follow the table, '
-                                f'{name} is constant {span_words(spans)} while the IMU turns about its '
-                                'axis; check the driver of the table, and exclude that time')
+            return CheckFinding('frozen', REFUSE, f'joint states must follow the table, {name} is constant {span_words(spans)} while the '
+                                'IMU turns about its axis; check the driver of the table, and exclude that time')
     return None
 
 
@@ -204,9 +202,8 @@ def _rate_units(moments):
         yield wrong_rate_unit(f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: probably deg/s, '
                               'gyroscope_scale 57.29578; convert them in the driver')
     elif 1 / 80 < ratio < 1 / 40:
-        yield CheckFinding('rate_unit', REFUSE,
-                           f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as the IMU: probably '
-                      'degrees; convert them in the driver of the table')
+        yield CheckFinding('rate_unit', REFUSE, f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as '
+                           'the IMU: probably degrees; convert them in the driver of the table')
     elif not 0.5 < ratio < 2.0 and np.linalg.norm(cross)**2 > RELATED * np.trace(measured) * np.trace(reference) / 3:
         yield wrong_rate_unit(f'angular rates must be in rad/s, they are {ratio:.4g} times the rates of the joints: counts or volts?; '
                               'convert them in the driver')

@@ -226,8 +226,8 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
     if not cause:
         key, cause = 'imu_topic', ('its motion is not that of the table; give the topic of the IMU on the table, and check '
                                    'the names of the joints and both clocks')
-    return CheckFinding('on_table', REFUSE, 'the gyroscope must measure the motion of the joints, '
-                        f'they explain {100 * min(explained, 1.0):.0f} % of its rates at a gain of {gain:.2g}: {cause}', key=key)
+    return CheckFinding('on_table', REFUSE, 'the gyroscope must measure the motion of the joints, they explain '
+                        f'{100 * min(explained, 1.0):.0f} % of its rates at a gain of {gain:.2g}: {cause}', key=key)
 
 
 def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckFinding | None:
@@ -258,9 +258,8 @@ def _a_period_late(windows, table):
     # opposite rates: a wrong sign, or half a period
     if ambiguous or abs(shift) <= LEAST_SHIFT or unshifted < 0 or share < max(LEAST_SHARE_EXPLAINED, unshifted + SHARE_TIE):
         return None
-    return CheckFinding('on_table', REFUSE, 'both streams must share one clock, '
-                        f'the joints explain {100 * unshifted:.0f} % of the rates with a delay up to {LEAST_SHIFT} s '
-                        f'and {100 * share:.0f} % with a larger one: {_late(shift)}')
+    return CheckFinding('on_table', REFUSE, f'both streams must share one clock, the joints explain {100 * unshifted:.0f} % of the rates '
+                        f'with a delay up to {LEAST_SHIFT} s and {100 * share:.0f} % with a larger one: {_late(shift)}')
 
 
 def _late(shift):

@@ -264,8 +264,8 @@ def frame(evidence: MessageEvidence) -> Iterator[CheckFinding]:
     """Every message names its frame, the same one."""
     names = sorted(evidence.frame_ids)
     if '' in names:
-        yield CheckFinding('frame', WARNING, 'messages must name their frame, '
-                           f'{evidence.frame_ids[""]} of {sum(evidence.frame_ids.values())} have an '
+        yield CheckFinding('frame', WARNING, f'messages must name their frame, {evidence.frame_ids[""]} of '
+                           f'{sum(evidence.frame_ids.values())} have an '
                            "empty frame_id: they cannot be transformed; set the driver's frame_id, usually imu_link")
     if len(names) > 1:
         yield CheckFinding('frame', WARNING, 'messages of one topic must be of one sensor, frame_ids are '
@@ -283,8 +283,8 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
             continue
         if not np.isfinite(matrix).all() or (np.diag(matrix) < 0).any():
             yield CheckFinding('covariance', WARNING, f'variances of the {name} must be finite and not negative, they are '
-                               f'{_numbers(np.diag(matrix))}; filters that believe them diverge: correct the driver, '
-                               'or fill them with compensator_node')
+                               f'{_numbers(np.diag(matrix))}; filters that believe them diverge: correct the driver, or fill them with '
+                               'compensator_node')
         elif not matrix.any():
             if name != 'orientation':
                 yield CheckFinding('covariance', NOTE, f'the covariance of the {name} is unknown (zeros): estimators need it; '
@@ -292,8 +292,8 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
         elif not np.allclose(matrix, matrix.T, rtol=0, atol=SYMMETRY * np.abs(matrix).max()):
             yield CheckFinding('covariance', WARNING, f'the covariance of the {name} must be symmetric, it is not; correct the driver')
         elif not np.diag(matrix).all():
-            yield CheckFinding('covariance', WARNING, f'variances of the {name} must be greater than zero, '
-                               f'they are {_numbers(np.diag(matrix))}: a filter would treat these axes as exact; correct the driver')
+            yield CheckFinding('covariance', WARNING, f'variances of the {name} must be greater than zero, they are '
+                               f'{_numbers(np.diag(matrix))}: a filter would treat these axes as exact; correct the driver')
         else:
             yield CheckFinding('covariance', GOOD, f'standard deviations of the {name}: {_numbers(np.sqrt(np.diag(matrix)))}')
 
@@ -308,8 +308,8 @@ def orientation(evidence: MessageEvidence) -> Iterator[CheckFinding]:
         yield CheckFinding('orientation', WARNING, f'an orientation must be a unit quaternion, its length is {size:.3g}: set '
                            'orientation_covariance[0] to -1 where the sensor gives none (REP 145)')
     elif not given.any() and np.array_equal(np.abs(evidence.orientation), [0, 0, 0, 1]):
-        yield CheckFinding('orientation', NOTE, 'the orientation is the identity with an unknown covariance: '
-                           'set orientation_covariance[0] to -1 where the sensor gives none (REP 145)')
+        yield CheckFinding('orientation', NOTE, 'the orientation is the identity with an unknown covariance: set '
+                           'orientation_covariance[0] to -1 where the sensor gives none (REP 145)')
 
 
 def age(evidence: MessageEvidence) -> Iterator[CheckFinding]:
@@ -318,9 +318,8 @@ def age(evidence: MessageEvidence) -> Iterator[CheckFinding]:
         return
     median = float(np.median(evidence.age))
     if abs(median) > OLD:
-        yield CheckFinding('age', WARNING, f'stamps must agree with the clock of this computer within {OLD} s, '
-                           f'they are {abs(median):.3g} s '
-                           f'{"behind" if median > 0 else "ahead of"} it: transforms and filters drop such messages; '
+        yield CheckFinding('age', WARNING, f'stamps must agree with the clock of this computer within {OLD} s, they are '
+                           f'{abs(median):.3g} s {"behind" if median > 0 else "ahead of"} it: transforms and filters drop such messages; '
                            'synchronise the clocks, or for a recording play /clock and set use_sim_time')
     else:
         yield CheckFinding('age', GOOD, f'stamps are {1e3 * median:.1f} ms old when messages are received')

@@ -95,9 +95,8 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         return
     came = f'angular rates are {factor:.3g} times the rotation of gravity from one rest to the next'
     if abs(np.log2(factor)) % 1 == 0:
-        yield CheckFinding('full_scale', WARNING,
-                           f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set; correct its '
-                      'setting (a calibration would include the factor in the matrix, and be wrong after the correction)')
+        yield CheckFinding('full_scale', WARNING, f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set; '
+                           'correct its setting (a calibration would include the factor in the matrix, and be wrong after the correction)')
     else:
         yield CheckFinding('full_scale', WARNING,
                            f'{came}: the scale of the driver is wrong; correct it, or check that the IMU was at rest')
@@ -128,9 +127,8 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         what = 'no exchange of axes makes them fit'
     kinds = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}
     kind = kinds.get((match.turned, match.mirrored), 'turned or left-handed, not separable in this recording')
-    yield CheckFinding('handedness', REFUSE,
-                       'accelerometer and gyroscope must share right-handed axes, gravity does not rotate according to the rates: '
-                  f'{what} ({kind}); correct signs and order of the axes in the driver')
+    yield CheckFinding('handedness', REFUSE, 'accelerometer and gyroscope must share right-handed axes, gravity does not rotate '
+                       f'according to the rates: {what} ({kind}); correct signs and order of the axes in the driver')
 
 
 def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -152,9 +150,8 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 total, level = total + sum(counts), max([level, *(end.level for end, count in zip(ends, counts) if count)])
         if words:
             people = f' ({level / DEG:.0f} deg/s)' if unit == 'rad/s' else f' ({level / STANDARD_GRAVITY:.1f} g)'
-            yield CheckFinding('clipping', WARNING,
-                               f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at the end of the range; '
-                          'larger values are lost, move less or choose a wider range', samples=total)
+            yield CheckFinding('clipping', WARNING, f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at '
+                               'the end of the range; larger values are lost, move less or choose a wider range', samples=total)
 
 
 def _held(evidence, sensor):
@@ -179,9 +176,8 @@ def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         if size > MOST_BIAS[sensor]:
             people = f'{size / STANDARD_GRAVITY:.2f} g' if sensor == 'accelerometer' else f'{size / DEG:.0f} deg/s'
             values = ', '.join(f'{value:+.2f}' for value in found[sensor])
-            yield CheckFinding('bias', WARNING,
-                               f'the bias of the {sensor} is {people} ([{values}] {unit}), more than any grade of sensor has; check '
-                          'offsets in the driver, the supply and the soldering of the sensor')
+            yield CheckFinding('bias', WARNING, f'the bias of the {sensor} is {people} ([{values}] {unit}), more than any grade of '
+                               'sensor has; check offsets in the driver, the supply and the soldering of the sensor')
 
 
 def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -196,11 +192,9 @@ def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     else:
         what = f'median of {len(rest.force)} stretches' if len(rest.force) > 1 else 'one stretch'
     if abs(off) > GRAVITY_SHARE:
-        yield CheckFinding('gravity', WARNING,
-                           f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, '
-                           f'the accelerometer reads {rest.length:.3f} ({what}), '
-                      f'{100 * off:+.1f} %: scale or bias is wrong (gravity differs by '
-                      f'{100 * GRAVITY_PLACE_SHARE} % between sites)')
+        yield CheckFinding('gravity', WARNING, f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads '
+                           f'{rest.length:.3f} ({what}), {100 * off:+.1f} %: scale or bias is wrong (gravity differs by '
+                           f'{100 * GRAVITY_PLACE_SHARE} % between sites)')
     else:
         yield CheckFinding('gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})')
 
@@ -210,10 +204,9 @@ def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     frozen = evidence.chunks.size * int(np.logical_and(*evidence.frozen.values()).sum())
     share = (evidence.n_repeated - frozen) / max(evidence.n_samples, 1)
     if share > REPEATED_SHARE and evidence.quiet_range.all():
-        yield CheckFinding('repeated_readings', WARNING,
-                           f'{100 * share:.0f} % of the samples repeat all six readings of the one before: '
-                           'the driver publishes faster than '
-                      'the sensor measures, and noise is underestimated; publish each measurement once')
+        yield CheckFinding('repeated_readings', WARNING, f'{100 * share:.0f} % of the samples repeat all six readings of the one before: '
+                           'the driver publishes faster than the sensor measures, and noise is underestimated; publish each measurement '
+                           'once')
 
 
 def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -241,9 +234,8 @@ def temperature(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     low, high = evidence.temperature_c
     if low < -80 or high > 180:
         kelvin = ': kelvin?' if 200 < low and high < 450 else ''
-        yield CheckFinding('temperature', WARNING,
-                           f'temperature must be in degrees Celsius, it lies between {low:.1f} and {high:.1f}{kelvin}; '
-                           'convert it in the driver')
+        yield CheckFinding('temperature', WARNING, f'temperature must be in degrees Celsius, it lies between {low:.1f} and '
+                           f'{high:.1f}{kelvin}; convert it in the driver')
     else:
         yield CheckFinding('temperature', GOOD, f'temperature {low:.1f} to {high:.1f} degrees Celsius')
 

@@ -376,8 +376,7 @@ def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **cho
             contents[SPECTRUM_TOPIC] = {'lines': [{'frequency': float(f), **_by_sensor(density, k)} for k, f in enumerate(frequency)]}
         return View(result.calibration, contents, _coverage(result), contents[RESIDUAL_TOPIC]['windows'][-1]['time'])
     if table is not None:
-        raise InputError('a table or arm needs a recording, a calibration file was given; '
-                         'omit one')
+        raise InputError('a table or arm needs a recording, a calibration file was given; omit one')
     calibration = files.read_calibration(path)
     return View(calibration, {PARAMETERS_TOPIC: parameters(calibration, tolerances_of(calibration.model))}, None)
 
