@@ -5,15 +5,7 @@ import struct
 import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
-from msg_adapters.layout import (
-    FRAME_OFFSET,
-    MessageError,
-    MessageLayout,
-    Packed,
-    aligned,
-    open_header,
-    overlapping,
-)
+from msg_adapters.layout import FRAME_OFFSET, MessageError, MessageLayout, Packed, aligned, open_header, overlapping
 
 IMU_TYPE = 'sensor_msgs/msg/Imu'
 

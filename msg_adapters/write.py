@@ -141,8 +141,7 @@ def write_session(path: str | PathLike[str], imu: ImuSamples, joints: JointSampl
             _write_batch(bag, ids, received, [(samples, encode) for _, _, samples, encode in streams], parts)
 
 
-def write_trajectories(path: str | PathLike[str], parts: Sequence[tuple[int, TrajectoryPoints]], *,
-                       storage: str = 'sqlite3') -> None:
+def write_trajectories(path: str | PathLike[str], parts: Sequence[tuple[int, TrajectoryPoints]], *, storage: str = 'sqlite3') -> None:
     """
     Write joint trajectories into a new bag, each at the time (ns) at which it shall begin: played back, it drives the joints.
 

@@ -22,8 +22,8 @@ AGREEMENT_TIE = 0.05
 
 def signed_permutations() -> np.ndarray:
     """Return the 48 matrices that exchange axes and signs, the identity first, then by number of changes; shape (48, 3, 3)."""
-    found = [np.eye(3)[list(order)] * np.array(signs)[:, None] for order in permutations(range(3)) for signs in product((1.0, -1.0),
-                                                                                                                        repeat=3)]
+    every_sign = product((1.0, -1.0), repeat=3)
+    found = [np.eye(3)[list(order)] * np.array(signs)[:, None] for order, signs in product(permutations(range(3)), every_sign)]
     return np.array(sorted(found, key=lambda matrix: (matrix != np.eye(3)).any(axis=1).sum()))
 
 

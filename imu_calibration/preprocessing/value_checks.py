@@ -121,8 +121,8 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         if turning.everywhere:
             yield CheckFinding('handedness', GOOD, 'accelerometer and gyroscope share right-handed axes')
         return
-    what = ', '.join(f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}" for i, j,
-                     sign in match.exchanges(turning.seen))
+    what = ', '.join(f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}"
+                     for i, j, sign in match.exchanges(turning.seen))
     if not what or match.agreement < MIN_MATCH:
         what = 'no exchange of axes makes them fit'
     kinds = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}

@@ -60,16 +60,6 @@ class Planned:
         """Checks and doubts about the limits, a line each."""
         return [] if self.table is None else [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(self.table))]
 
-    @property
-    def seconds(self) -> float:
-        """Total time, s."""
-        return self.plan.seconds
-
-    @property
-    def lower_bound_seconds(self) -> float:
-        """Time that no plan of these motions undercuts, s."""
-        return self.plan.lower_bound_seconds
-
     @cached_property
     def report(self) -> str:
         """The report as one HTML page."""
@@ -82,13 +72,13 @@ class Planned:
         from imu_calibration.report.plan_page import draw_progress
         return draw_progress(self.plan)
 
-    def save(self, folder: str | PathLike, *, report: bool = True, bag: bool = True, storage: str = 'sqlite3') -> None:
-        """Write plan.yaml, of joints trajectory.yaml, and, when wanted, report.html and the bag `trajectory` with a message per motion."""
+    def save(self, folder: str | PathLike, *, report: bool = True, storage: str = 'sqlite3') -> None:
+        """Write plan.yaml, of joints trajectory.yaml and the bag `trajectory` with a message per motion, and, when wanted, report.html."""
         from msg_adapters.write import write_trajectories
         place, moves_joints = files.make_folder(folder), self.table is not None and bool(self.plan.motions)
         text = documents.to_text(plan_to_mapping(self.plan, self.provenance))
         page = self.report if report else ''
-        if moves_joints and bag:  # first, since it refuses where there is one already
+        if moves_joints:  # first, since it refuses where there is one already
             write_trajectories(place / 'trajectory', self._messages(), storage=storage)
         if report:
             files.write_text(place / 'report.html', page)

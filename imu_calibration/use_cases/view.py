@@ -344,8 +344,7 @@ class View:
             When foxglove-sdk is not installed or the place cannot be written.
 
         """
-        files.write_whole(path, foxglove_bytes(self.contents, self.coverage, self.calibration.frame_id or 'imu_link',
-                                                seconds=self.seconds))
+        files.write_whole(path, foxglove_bytes(self.contents, self.coverage, self.calibration.frame_id or 'imu_link', seconds=self.seconds))
 
 
 def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]) -> View:
