@@ -3,6 +3,7 @@
 import copy
 import io
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,11 +15,11 @@ from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.samples import NominalScaling, SampleBlock
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SECTIONS, SENSORS
 from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.forward_equations import columns
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import Accumulator, WindowBlock
+from imu_calibration.estimation.accumulator import FACTORS, Accumulator, WindowBlock
 from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics, joined_motion, reduce_window
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
@@ -41,7 +42,6 @@ from imu_calibration.references.turntable.session_data import (
 )
 
 SAVED_FORMAT = 'imu_calibration/accumulator/2'
-_MODEL = ('accelerometer', 'gyroscope', 'reference')
 _PLAIN = ('counts', 'frame_id', 'first_stamp_ns', 'last_stamp_ns', 'largest_rate', 'largest_force', 'temperature_c')
 
 
@@ -59,7 +59,7 @@ def to_bytes(gathered: SessionData, model: SensorModel, extension: ModelExtensio
         Effects added to the requested model.
 
     """
-    names = {name: list(getattr(model, name)) for name in (*_MODEL, 'joint_names')}
+    names = {name: list(getattr(model, name)) for name in (*SECTIONS, 'joint_names')}
     header = {'format': SAVED_FORMAT, 'model': names | {'joint_errors': model.joint_names.errors},
               'effects': model.definitions, 'demand': extension.to_mapping(),
               'temperature_ref_c': model.temperature_ref_c,
@@ -82,9 +82,23 @@ def to_bytes(gathered: SessionData, model: SensorModel, extension: ModelExtensio
 
 def _header_of(accumulator):
     return {'samples': accumulator.samples, 'windows': accumulator.windows, 'kinds': [row.kind for row in accumulator.rows],
-            'within': [list(key) for key in accumulator.within], 'slow': [list(key) for key in accumulator.slow],
-            'slow_rows': accumulator.slow_rows, 'block_length': accumulator.block_length,
-            'blocks': [_outline(block) for block in accumulator.blocks]}
+            'slow_rows': accumulator.slow_rows, 'block_length': accumulator.block_length, **_keys_of(accumulator),
+            'blocks': [{'session': block.session, 'start': block.start, 'windows': block.windows, **_keys_of(block)}
+                       for block in accumulator.blocks]}
+
+
+def _keys_of(part: Accumulator | WindowBlock):
+    """Return the keys of the factors, in the order of `_factors_of`."""
+    return {name: [list(key) for key in getattr(part, name)] for name in FACTORS}
+
+
+def _factors_of(part: Accumulator | WindowBlock, label):
+    return {f'{label}{name}.{k}': factor for name in FACTORS for k, factor in enumerate(getattr(part, name).values())}
+
+
+def _factors_in(header, arrays, label):
+    """Return the fields `FACTORS` of an Accumulator or WindowBlock."""
+    return {name: {tuple(key): arrays[f'{label}{name}.{k}'] for k, key in enumerate(header[name])} for name in FACTORS}
 
 
 def _arrays_of(accumulator, label):
@@ -94,11 +108,9 @@ def _arrays_of(accumulator, label):
     for sensor in sorted(rows[0].sensors) if rows else []:
         for name in ('mean', 'noise_variance', 'inflation'):
             arrays[f'{label}{sensor}.{name}'] = np.array([getattr(row.sensors[sensor], name) for row in rows])
-    for name in ('within', 'slow'):
-        arrays |= {f'{label}{name}.{number}': factor for number, factor in enumerate(getattr(accumulator, name).values())}
+    arrays |= _factors_of(accumulator, label)
     for number, block in enumerate(accumulator.blocks):
-        for name in ('within', 'slow'):
-            arrays |= {f'{label}block{number}.{name}.{k}': factor for k, factor in enumerate(getattr(block, name).values())}
+        arrays |= _factors_of(block, f'{label}block{number}.')
     return arrays
 
 
@@ -148,7 +160,7 @@ def saved_extension(data: bytes) -> ModelExtension:
 
 def _model(header):
     point = {name: np.array(value, float) for name, value in header['point'].items()}
-    effects, names = (tuple(header['model'][name]) for name in _MODEL), header['model']['joint_names']
+    effects, names = (tuple(header['model'][name]) for name in SECTIONS), header['model']['joint_names']
     return SensorModel(*effects, JointNames.of(names, header['model'].get('joint_errors')), header['temperature_ref_c'], point,
                        catalogue=Catalogue.from_definitions(header.get('effects', {})))
 
@@ -161,7 +173,7 @@ def _check(header, model):
 
 
 def _text(model):
-    effects = ' / '.join('+'.join(getattr(model, sensor)) or 'none' for sensor in _MODEL)
+    effects = ' / '.join('+'.join(getattr(model, sensor)) or 'none' for sensor in SECTIONS)
     return f'{effects} at {model.temperature_ref_c:g} C'
 
 
@@ -189,21 +201,10 @@ def _fields(header, arrays, label):
                       for sensor, (mean, variance, inflation) in columns.items()}
         time, duration, *step = map(float, numbers[k])   # files of earlier versions have no steps
         rows.append(WindowStatistics(kind, time, duration, int(whole[k, 0]), statistics, int(whole[k, 1]), *step))
-    within, slow = ({tuple(key): arrays[f'{label}{name}.{number}'] for number, key in enumerate(header[name])}
-                    for name in ('within', 'slow'))
-    blocks = [_block(outline, f'{label}block{number}', arrays) for number, outline in enumerate(header['blocks'])]
-    return {'rows': rows, 'within': within, 'slow': slow, 'slow_rows': header['slow_rows'], 'samples': header['samples'],
-            'windows': header['windows'], 'blocks': blocks, 'block_length': header['block_length']}
-
-
-def _outline(block):
-    return {'session': block.session, 'start': block.start, 'windows': block.windows,
-            'within': [list(key) for key in block.within], 'slow': [list(key) for key in block.slow]}
-
-
-def _block(outline, label, arrays):
-    within, slow = ({tuple(key): arrays[f'{label}.{name}.{k}'] for k, key in enumerate(outline[name])} for name in ('within', 'slow'))
-    return WindowBlock(outline['session'], outline['start'], outline['windows'], within, slow)
+    blocks = [WindowBlock(known['session'], known['start'], known['windows'], **_factors_in(known, arrays, f'{label}block{number}.'))
+              for number, known in enumerate(header['blocks'])]
+    counts = {name: Counter(header[name]) for name in ('slow_rows', 'samples', 'windows')}
+    return {'rows': rows, 'blocks': blocks, 'block_length': header['block_length'], **counts, **_factors_in(header, arrays, label)}
 
 
 class Collector:

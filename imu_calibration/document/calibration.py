@@ -304,7 +304,7 @@ def implausible(calibration: Calibration, sensor: str | None = None) -> list[str
             continue
         amplitudes = effect.amplitudes(calibration.values[calibration.model.slices[effect.key]])
         if effect.surpasses(amplitudes):
-            grade, largest, source = effect.plausible[-1]
+            grade, largest, source = effect.plausible
             size = max(map(abs, amplitudes))
             lines.append(f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, '
                          f'more than ten times the known values of {grade} instruments ({largest:.3g}; {source}): check units and axes')

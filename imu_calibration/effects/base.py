@@ -143,7 +143,7 @@ class Effect:
     step: float = 1e-4
     """Step of the central difference that turns a warp into columns."""
     plausible: tuple = ()
-    """Plausible size by grade: (grade, largest, source), in `unit`."""
+    """(Grade of instruments, largest plausible size in `unit`, source); empty: unknown."""
     time_constant: bool = False
     """Whether the last component is a time constant, s, on which the columns depend, and all preceding ones are amplitudes."""
     located: bool = False
@@ -216,7 +216,7 @@ class Effect:
     @property
     def largest(self) -> float:
         """Largest plausible size, infinite if unknown."""
-        return max((limit for _, limit, _ in self.plausible), default=np.inf)
+        return self.plausible[1] if self.plausible else np.inf
 
     def surpasses(self, amplitudes: np.ndarray, sd: np.ndarray | float = 0.0) -> bool:
         """Return whether amplitudes exceed those of any known instrument by more than three standard deviations."""

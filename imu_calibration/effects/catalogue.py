@@ -105,7 +105,7 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
         compensation='none' if group.uses & {'time', 'attitude', *JOINT_INPUTS} else 'exact', groups=(group,),
         coefficients=partial(amplitude_coefficients, own_axis=len(columns) == 3),
         smooth=not group.uses - {'time', 'temperature', 'thermal branch', 'reference temperature', 'time constant'},
-        plausible=(('such', largest, 'its definition'),) if largest else (),
+        plausible=('such', largest, 'its definition') if largest else (),
         definition={key: value for key, value in definition.items() if value is not None},
         against=tuple(drawn for quantity, drawn in DRAWN_AGAINST.items() if quantity in group.uses)[:1])
 

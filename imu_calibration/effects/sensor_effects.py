@@ -50,7 +50,7 @@ def _pair(sensor):
             explanation=f'The {sensor} has an offset.',
             tolerance=small,
             tolerance_reason='1 mg, which tilts a levelled attitude by 1 mrad' if accel else '0.01 deg/s, 0.6 deg of heading a minute',
-            prior_sd=2.0 if accel else 0.2, plausible=(('consumer', 1.0 if accel else 0.1, 'field catalogue 6.1, 6.2'),),
+            prior_sd=2.0 if accel else 0.2, plausible=('consumer', 1.0 if accel else 0.1, 'field catalogue 6.1, 6.2'),
             motion=('static_poses',), groups=(base.CONSTANT,), coefficients=amplitude_coefficients),
         Effect(
             name='matrix', sensor=sensor, role=Role.LINEAR, components=MATRIX, shape=(3, 3), unit='1',
@@ -66,15 +66,15 @@ def _pair(sensor):
             'so that equal inputs of opposite sign do not give opposite readings.',
             tolerance=small / full**2, tolerance_reason='1 mg at 1 g' if accel else '0.01 deg/s at 100 deg/s',
             prior_sd=100 * small / full**2,
-            plausible=(('consumer', 4e-4 / STANDARD_GRAVITY if accel else 0.5 * DEG / (100 * DEG)**2, 'ADIS16460 data sheet: '
-                        '0.1 % / 0.5 % of range'),),
+            plausible=('consumer', 4e-4 / STANDARD_GRAVITY if accel else 0.5 * DEG / (100 * DEG)**2, 'ADIS16460 data sheet: '
+                        '0.1 % / 0.5 % of range'),
             motion=curved, groups=(own['SQUARES'],),
             coefficients=partial(along_axis_coefficients, function=base.square_coefficients)),
         Effect(
             name=f'{short}_scale_asymmetry', sensor=sensor, unit='1', against=(kind,),
             explanation=f'The {sensor} scale factor differs between positive and negative input.',
             tolerance=1e-3, tolerance_reason='1 mg between +1 g and -1 g' if accel else 'as the matrix', prior_sd=0.05,
-            plausible=(('consumer', 2e-3, 'field catalogue 6.1: 100-200 ppm typical'),),
+            plausible=('consumer', 2e-3, 'field catalogue 6.1: 100-200 ppm typical'),
             motion=curved, groups=(own['SIGNED'],),
             coefficients=partial(along_axis_coefficients, function=base.signed_coefficients)),
         Effect(
@@ -82,7 +82,7 @@ def _pair(sensor):
             smooth=True,
             explanation=f'The {sensor} bias follows the temperature.',
             tolerance=0.1 * small, tolerance_reason='1 mg over 10 K' if accel else '0.01 deg/s over 10 K', prior_sd=10 * small,
-            plausible=(('consumer', 2 * MILLI_G if accel else 0.05 * DEG, 'ADXL358, ADIS16460 data sheets, ten times typical'),),
+            plausible=('consumer', 2 * MILLI_G if accel else 0.05 * DEG, 'ADXL358, ADIS16460 data sheets, ten times typical'),
             motion=('warm_up',), needs=('temperature',),
             groups=(base.TEMPERATURE,), coefficients=amplitude_coefficients),
         Effect(
@@ -91,7 +91,7 @@ def _pair(sensor):
             title=f'{short} thermal bias, second order',
             explanation=f'The {sensor} bias bends with the temperature: it follows its square too.',
             tolerance=0.01 * small, tolerance_reason='1 mg over 10 K' if accel else '0.01 deg/s over 10 K', prior_sd=small,
-            plausible=(('consumer', 0.1 * MILLI_G if accel else 2.5e-3 * DEG, 'as much as the first order over 20 K'),),
+            plausible=('consumer', 0.1 * MILLI_G if accel else 2.5e-3 * DEG, 'as much as the first order over 20 K'),
             motion=('warm_up',), needs=('temperature',),
             groups=(base.TEMPERATURE_SQUARED,), coefficients=amplitude_coefficients),
         Effect(
@@ -100,7 +100,7 @@ def _pair(sensor):
             explanation=f'The {sensor} bias depends on the thermal branch: the branches of cooling and warming differ '
             'by twice this.',
             tolerance=small, tolerance_reason='as the bias', prior_sd=20 * small,
-            plausible=(('consumer', 5 * MILLI_G if accel else 0.1 * DEG, 'as much as the thermal bias over some kelvins'),),
+            plausible=('consumer', 5 * MILLI_G if accel else 0.1 * DEG, 'as much as the thermal bias over some kelvins'),
             motion=('warm_and_cool',), needs=('temperature', 'cooling'),
             groups=(base.BRANCH,), coefficients=amplitude_coefficients),
         Effect(
@@ -110,15 +110,15 @@ def _pair(sensor):
             + ('along the axis of each' if accel else 'of each direction') + ', by this for each variance that is left in the band.',
             tolerance=small / VIBRATION_VARIANCE, prior_sd=100 * small / VIBRATION_VARIANCE,
             tolerance_reason=f'as the bias, at a vibration of {np.sqrt(VIBRATION_VARIANCE):.2g} m/s^2 rms',
-            plausible=(('consumer', 2.0 if accel else 0.1, ('2 mg/g^2 (ADXL358 data sheet)' if accel else '0.05 deg/s/g^2')
-                        + ', where a hundredth of the amplitude is left in the band'),),
+            plausible=('consumer', 2.0 if accel else 0.1, ('2 mg/g^2 (ADXL358 data sheet)' if accel else '0.05 deg/s/g^2')
+                        + ', where a hundredth of the amplitude is left in the band'),
             motion=('shake',), needs=('vibration',), groups=(base.VIBRATION,),
             coefficients=partial(amplitude_coefficients, own_axis=accel)),
         Effect(
             name=f'{short}_thermal_scale', sensor=sensor, unit='1/K', against=('temperature',),
             explanation=f'The {sensor} scale factor follows the temperature.',
             tolerance=1e-4, tolerance_reason='1e-3 over 10 K', prior_sd=0.01,
-            plausible=(('consumer', 1e-3, 'ADXL358, ADIS16460 data sheets'),),
+            plausible=('consumer', 1e-3, 'ADXL358, ADIS16460 data sheets'),
             motion=('warm_up',), needs=('temperature',) if accel else ('temperature', 'rotation'),
             groups=(own['THERMAL'],), coefficients=matrix_coefficients),
         Effect(
@@ -126,7 +126,7 @@ def _pair(sensor):
             explanation=f'Each {sensor} axis has crosstalk of the remaining axes with a different lag: '
             'its output contains their rate of change.',
             tolerance=1e-5, tolerance_reason='1 mrad of cross coupling through a lag of 10 ms', prior_sd=1e-3,
-            plausible=(('consumer', 5e-4, '10 mrad of cross coupling through a lag of 50 ms'),),
+            plausible=('consumer', 5e-4, '10 mrad of cross coupling through a lag of 50 ms'),
             motion=('oscillate_fast', 'two_axis'), needs=('rotation',), moot=_one_axis,
             groups=(own['CHANGE'],), coefficients=cross_axis_coefficients),
         Effect(
@@ -135,14 +135,14 @@ def _pair(sensor):
             explanation=f'The {sensor} bias settles after turn-on like 1 - exp(-t / time constant), with no temperature to explain it.',
             tolerance=small, tolerance_reason='as the bias', prior=(0.0, 0.0, 0.0, 300.0),
             prior_sd=(50 * small, 50 * small, 50 * small, 1000.0),
-            plausible=(('consumer', 20 * MILLI_G if accel else 1 * DEG, 'field catalogue 6.1: warm-up of up to some mg over 1-15 min'),),
+            plausible=('consumer', 20 * MILLI_G if accel else 1 * DEG, 'field catalogue 6.1: warm-up of up to some mg over 1-15 min'),
             motion=('warm_up',), compensation='none', groups=(own['WARM_UP'],),
             coefficients=amplitude_coefficients),
         Effect(
             name=f'{short}_bias_trend', sensor=sensor, unit=f'{unit}/s', smooth=True, against=('time',),
             explanation=f'The {sensor} bias changes linearly with time.',
             tolerance=small / 600, tolerance_reason='as the bias, over 10 min', prior_sd=50 * small / 600,
-            plausible=(('consumer', (20 * MILLI_G if accel else 1 * DEG) / 60, 'as the drift after turn-on, within 1 min'),),
+            plausible=('consumer', (20 * MILLI_G if accel else 1 * DEG) / 60, 'as the drift after turn-on, within 1 min'),
             motion=('warm_up',), compensation='none', groups=(base.TIME,), coefficients=amplitude_coefficients),
         Effect(
             name=f'{short}_saturation', sensor=sensor, role=Role.LIMIT, components=('level',), shape=(), unit=unit,
@@ -158,7 +158,7 @@ ACCELEROMETER = _pair('accelerometer') + (
         name='accel_cubic', sensor='accelerometer', unit='(m/s^2)^-2', against=('force',),
         explanation='The accelerometer output bends with the cube of its input (K3), so that its scale factor changes with the input.',
         tolerance=MILLI_G / STANDARD_GRAVITY**3, tolerance_reason='1 mg at 1 g', prior_sd=100 * MILLI_G / STANDARD_GRAVITY**3,
-        plausible=(('consumer', 1e-4 / STANDARD_GRAVITY**2, 'field catalogue 6.1: some 10 ug/g^3'),),
+        plausible=('consumer', 1e-4 / STANDARD_GRAVITY**2, 'field catalogue 6.1: some 10 ug/g^3'),
         motion=('centrifuge',), groups=(base.CUBES['accelerometer'],),
         coefficients=partial(along_axis_coefficients, function=base.cube_coefficients)),
     Effect(
@@ -166,7 +166,7 @@ ACCELEROMETER = _pair('accelerometer') + (
         explanation='The accelerometers are pendulums that give way: '
         'products of specific-force components enter the output (Avrutov 2017, eq. 4).',
         tolerance=MILLI_G / STANDARD_GRAVITY**2, tolerance_reason='1 mg for 1 g on two axes', prior_sd=100 * MILLI_G / STANDARD_GRAVITY**2,
-        plausible=(('consumer', 1e-3 / STANDARD_GRAVITY, 'Avrutov 2017, sample 2: 1 mV/g^2'),),
+        plausible=('consumer', 1e-3 / STANDARD_GRAVITY, 'Avrutov 2017, sample 2: 1 mV/g^2'),
         motion=('static_dense',), groups=(base.SQUARES['accelerometer'],),
         coefficients=product_coefficients),
     Effect(
@@ -174,14 +174,14 @@ ACCELEROMETER = _pair('accelerometer') + (
         title='size effect: origin to the sensitive point of each axis',
         explanation='The three accelerometers sit at different points: each has a lever arm of its own (Zhang 2017, eq. 11-17).',
         tolerance=1e-3, tolerance_reason='1 mm, 0.1 m/s^2 at 10 rad/s', prior_sd=0.03,
-        plausible=(('consumer', 0.03, 'field catalogue 6.1: 1-30 mm'),), motion=('oscillate_x', 'oscillate_y', 'oscillate_z'),
+        plausible=('consumer', 0.03, 'field catalogue 6.1: 1-30 mm'), motion=('oscillate_x', 'oscillate_y', 'oscillate_z'),
         needs=('rotation',), groups=(base.LEVER,), coefficients=lever_coefficients),
     Effect(
         name='lever_arm', sensor='accelerometer', role=Role.ARM, unit='m',
         title='lever arm of the triad (nuisance parameter)', in_reference=True, nuisance=True, contained_in='accel_size_effect',
         explanation='The whole accelerometer triad is displaced from its assumed point: one common lever arm.',
         tolerance=1e-3, tolerance_reason='the same arm, for the whole triad', prior_sd=0.5,
-        plausible=(('consumer', 1.0, 'field catalogue 6.1: cm to dm'),), motion=('oscillate_x', 'oscillate_y', 'oscillate_z'),
+        plausible=('consumer', 1.0, 'field catalogue 6.1: cm to dm'), motion=('oscillate_x', 'oscillate_y', 'oscillate_z'),
         compensation='none', needs=('rotation',), groups=(base.LEVER,), coefficients=lever_coefficients),
 )
 
@@ -191,7 +191,7 @@ GYROSCOPE = _pair('gyroscope') + (
         against=('force',),
         explanation='The gyroscopes respond to specific force: their bias changes with attitude (g-sensitivity).',
         tolerance=0.01 * DEG / STANDARD_GRAVITY, tolerance_reason='0.01 deg/s at 1 g', prior_sd=1.0 * DEG / STANDARD_GRAVITY,
-        plausible=(('consumer', 0.1 * DEG / STANDARD_GRAVITY, 'ADIS16460 data sheet: 0.01 deg/s/g'),), motion=('static_poses',),
+        plausible=('consumer', 0.1 * DEG / STANDARD_GRAVITY, 'ADIS16460 data sheet: 0.01 deg/s/g'), motion=('static_poses',),
         groups=(base.TRUE_INPUT['accelerometer'],), coefficients=amplitude_coefficients),
     Effect(
         name='gyro_force_squared', sensor='gyroscope',
@@ -200,7 +200,7 @@ GYROSCOPE = _pair('gyroscope') + (
         explanation='The gyroscopes respond to squares and products of specific force: '
         'their elements yield more along one axis than along another.',
         tolerance=0.01 * DEG / STANDARD_GRAVITY**2, tolerance_reason='0.01 deg/s at 1 g', prior_sd=0.2 * DEG / STANDARD_GRAVITY**2,
-        plausible=(('consumer', 0.05 * DEG / STANDARD_GRAVITY**2, 'half of the g-sensitivity at 1 g'),),
+        plausible=('consumer', 0.05 * DEG / STANDARD_GRAVITY**2, 'half of the g-sensitivity at 1 g'),
         motion=('static_dense', 'centrifuge'),
         groups=(base.SQUARES['accelerometer'],),
         coefficients=amplitude_coefficients),
@@ -208,7 +208,7 @@ GYROSCOPE = _pair('gyroscope') + (
         name='gyro_rate_product', sensor='gyroscope', components=PRODUCTS, shape=(3, 3), unit='(rad/s)^-1', against=('rate',),
         explanation='Products of rate components enter the gyroscope output (Avrutov 2017, eq. 10).',
         tolerance=1e-3, tolerance_reason='as the matrix at 1 rad/s', prior_sd=0.3,
-        plausible=(('consumer', 0.06, 'Avrutov 2017, sample 4: 1e-3 V/(deg/s)^2 at 0.1 V/(deg/s) is 0.6'),), motion=('two_axis',),
+        plausible=('consumer', 0.06, 'Avrutov 2017, sample 4: 1e-3 V/(deg/s)^2 at 0.1 V/(deg/s) is 0.6'), motion=('two_axis',),
         needs=('rotation',), groups=(base.SQUARES['gyroscope'],),
         coefficients=product_coefficients),
 )

@@ -1,5 +1,6 @@
 """Accumulated factors of windows, and attitudes of rests in them."""
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -21,8 +22,12 @@ LEAST_ROWS = 16
 """Rows that an accumulator keeps however many share the memory: neighbours of the same kind must be among them."""
 
 
+FACTORS = ('within', 'slow')
+"""Fields with the triangular factors of the centred rows, and of their slow parts."""
+
+
 class _CentredRows:
-    """Addition of the centred rows of windows to the factors `within` and `slow`."""
+    """Addition of the centred rows of windows to the `FACTORS`."""
 
     within: dict
     slow: dict
@@ -35,9 +40,9 @@ class _CentredRows:
                 stack(self.slow, (sensor, window.kind), statistics.slow)
 
     def _stack_all_of(self, other):
-        for mine, its in ((self.within, other.within), (self.slow, other.slow)):
-            for key, factor in its.items():
-                stack(mine, key, factor)
+        for name in FACTORS:
+            for key, factor in getattr(other, name).items():
+                stack(getattr(self, name), key, factor)
 
 
 @dataclass(eq=False)
@@ -87,11 +92,11 @@ class Accumulator(_CentredRows):
     """(sensor, kind) -> triangular factor of the centred rows."""
     slow: dict = field(default_factory=dict)
     """(sensor, kind) -> triangular factor of the slow parts of the centred rows."""
-    slow_rows: dict = field(default_factory=dict)
+    slow_rows: Counter = field(default_factory=Counter)
     """Kind -> number of rows in `slow`."""
-    samples: dict = field(default_factory=dict)
+    samples: Counter = field(default_factory=Counter)
     """Kind -> number of samples."""
-    windows: dict = field(default_factory=dict)
+    windows: Counter = field(default_factory=Counter)
     """Kind -> number of windows."""
     blocks: list[WindowBlock] = field(default_factory=list)
     """The centred rows once more, part by part in order of time."""
@@ -105,11 +110,12 @@ class Accumulator(_CentredRows):
     def add(self, window: WindowStatistics) -> None:
         """Add one window (WindowStatistics)."""
         self._stack_window(window)
-        self.slow_rows[window.kind] = self.slow_rows.get(window.kind, 0) + window.sensors[SENSORS[0]].slow_rows
+        self.slow_rows[window.kind] += window.sensors[SENSORS[0]].slow_rows
+        self.samples[window.kind] += window.count
+        self.windows[window.kind] += 1
         if self.in_blocks:
             self._add_to_blocks(window)
         self.rows.append(_without_within(window))
-        self._count(window.kind, window.count, 1)
         if len(self.rows) > self._capacity:
             self._thin()
 
@@ -119,17 +125,15 @@ class Accumulator(_CentredRows):
 
     def copy(self) -> 'Accumulator':
         """Return an independent copy; rows and factors are never changed in place."""
-        maps: dict[str, Any] = {name: dict(getattr(self, name)) for name in ('within', 'slow', 'slow_rows', 'samples', 'windows')}
+        maps: dict[str, Any] = {name: getattr(self, name).copy() for name in ('within', 'slow', 'slow_rows', 'samples', 'windows')}
         return replace(self, rows=list(self.rows), blocks=[block.copy() for block in self.blocks], **maps)
 
     def merge(self, other: 'Accumulator') -> None:
         """Add another accumulator with the same columns; its recordings follow the ones of this accumulator."""
         self._stack_all_of(other)
-        for kind, count in other.slow_rows.items():
-            self.slow_rows[kind] = self.slow_rows.get(kind, 0) + count
+        for mine, its in ((self.slow_rows, other.slow_rows), (self.samples, other.samples), (self.windows, other.windows)):
+            mine.update(its)
         self.rows.extend(other.rows)
-        for kind, count in other.samples.items():
-            self._count(kind, count, other.windows[kind])
         self.blocks.extend(block.copy() for block in other.blocks if self.in_blocks)
         self.block_length = max(self.block_length, other.block_length)
         self._join_blocks()
@@ -154,10 +158,6 @@ class Accumulator(_CentredRows):
             pairs = [self.blocks[at:at + 2] for at in range(0, len(self.blocks), 2)]
             self.blocks = [pair[0].joined(pair[1]) if len(pair) == 2 else pair[0] for pair in pairs]
             self.block_length *= 2
-
-    def _count(self, kind, samples, windows):
-        self.samples[kind] = self.samples.get(kind, 0) + samples
-        self.windows[kind] = self.windows.get(kind, 0) + windows
 
     def _thin(self):
         """Join neighbours of one kind and recording into one row; their difference joins the centred rows of their kind."""
@@ -228,16 +228,14 @@ def selected_columns(wide: SensorModel, narrow: SensorModel) -> dict[str, np.nda
 def restrict(accumulator: Accumulator, wide: SensorModel, narrow: SensorModel) -> Accumulator:
     """Return the accumulator with only the columns that the model `narrow` needs, from one made with the model `wide`."""
     chosen = selected_columns(wide, narrow)
-    small = Accumulator(samples=dict(accumulator.samples), windows=dict(accumulator.windows), slow_rows=dict(accumulator.slow_rows))
-    small.within, small.slow = (_chosen(factors, chosen) for factors in (accumulator.within, accumulator.slow))
-    small.blocks = [replace(block, within=_chosen(block.within, chosen), slow=_chosen(block.slow, chosen)) for block in accumulator.blocks]
-    small.block_length, small.in_blocks, small.share = accumulator.block_length, accumulator.in_blocks, accumulator.share
-    small.rows = [restricted_window(row, chosen) for row in accumulator.rows]
-    return small
+    blocks = [replace(block, **_chosen_factors(block, chosen)) for block in accumulator.blocks]
+    rows = [restricted_window(row, chosen) for row in accumulator.rows]
+    return replace(accumulator.copy(), rows=rows, blocks=blocks, **_chosen_factors(accumulator, chosen))
 
 
-def _chosen(factors, chosen):
-    return {(sensor, kind): factor[:, chosen[sensor]] for (sensor, kind), factor in factors.items()}
+def _chosen_factors(part, chosen):
+    """Return the `FACTORS` of an accumulator or block with the columns `chosen` only."""
+    return {name: {key: factor[:, chosen[key[0]]] for key, factor in getattr(part, name).items()} for name in FACTORS}
 
 
 def restricted_window(window: WindowStatistics, chosen: dict[str, np.ndarray]) -> WindowStatistics:

@@ -16,7 +16,7 @@ from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, inverse_normal, scaled_lstsq
 from imu_calibration.estimation.session_noise import first_noise, updated_noise
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.weighted_system import Prior, WeightedSystem, fixed_parameters, make_prior
+from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters
 from imu_calibration.estimation.whitening import predict_session_offsets
 
 OUTLIER_P_VALUE = 1e-3
@@ -115,7 +115,7 @@ REST_NOISE_MARGIN = 1.1
 
 
 def implausible_estimates(system: WeightedSystem, values: np.ndarray, *, sd: np.ndarray, noises: dict[str, NoiseModel],
-                 free: np.ndarray) -> np.ndarray:
+                          free: np.ndarray) -> np.ndarray:
     """
     Return a mask of the parameters whose information may be an artefact of misfit.
 
@@ -171,8 +171,8 @@ LEAVING_ROUNDS = 5
 """Largest number of rounds of outlier exclusion; one outlier may hide another."""
 
 
-def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool = True, prior: Prior | None = None,
-          noise: dict[str, NoiseModel] | None = None, bias_processes: dict[str, tuple[BiasProcess, ...]] | None = None) -> Solution:
+def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool = True, noise: dict[str, NoiseModel] | None = None,
+          bias_processes: dict[str, tuple[BiasProcess, ...]] | None = None) -> Solution:
     """
     Estimate all parameters jointly from accumulated windows.
 
@@ -186,8 +186,6 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
     model : SensorModel
     allow_holding : bool
         Whether parameters that the data do not determine may be fixed at their prior.
-    prior : Prior, optional
-        Prior of the parameters; by default the one of the catalogue.
     noise : dict, optional
         Sensor -> NoiseModel, if known.
     bias_processes : dict, optional
@@ -206,9 +204,8 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
     if not accumulator.rows:
         raise NotObservableError('at least one static window, spin or dynamic stretch must be found, none was; '
                                  'rest the table between moves, or check the joint states', code='no_windows')
-    prior = prior or make_prior(model)
-    system = WeightedSystem(accumulator, model, prior)
-    values, free = start(system), ~fixed_parameters(model)
+    system = WeightedSystem(accumulator, model)
+    prior, values, free = system.prior, start(system), ~fixed_parameters(model)
     noises = noise or first_noise(system, values, bias_processes or {})
     if noise is None:
         values, noises = _with_noise(system, values, noises, free)

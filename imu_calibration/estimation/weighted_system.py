@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -72,47 +71,23 @@ class WeightedSystem:
     ----------
     accumulator : Accumulator
     model : SensorModel
-    prior : Prior
 
     """
 
-    def __init__(self, accumulator: Accumulator, model: SensorModel, prior: Prior):
-        self.model, self.prior, self.accumulator = model, prior, accumulator
+    def __init__(self, accumulator: Accumulator, model: SensorModel):
+        self.model, self.prior, self.accumulator = model, make_prior(model), accumulator
+        rows = accumulator.rows
         self.dof_within = {k: max(accumulator.samples[k] - accumulator.windows[k], 1) for k in accumulator.samples}
-        self.means = {s: np.array([row.sensors[s].mean for row in accumulator.rows]) for s in SENSORS}
+        self.means = {s: np.array([row.sensors[s].mean for row in rows]) for s in SENSORS}
         """Sensor -> mean rows, shape (n_windows, p + 3)."""
         self.within = {s: {k: f for (sensor, k), f in sorted(accumulator.within.items()) if sensor == s and len(f)} for s in SENSORS}
         """Sensor -> kind -> factor of the centred rows."""
-
-    @cached_property
-    def times(self) -> np.ndarray:
-        """Middle of each window, s."""
-        return np.array([row.time for row in self.accumulator.rows])
-
-    @cached_property
-    def counts(self) -> np.ndarray:
-        """Samples of each window."""
-        return np.array([row.count for row in self.accumulator.rows], float)
-
-    @cached_property
-    def durations(self) -> np.ndarray:
-        """Length of each window, s."""
-        return np.array([row.duration for row in self.accumulator.rows])
-
-    @cached_property
-    def kinds(self) -> list[str]:
-        """Kind of each window."""
-        return [row.kind for row in self.accumulator.rows]
-
-    @cached_property
-    def sessions(self) -> list[np.ndarray]:
+        self.times, self.counts, self.durations = np.array([(row.time, row.count, row.duration) for row in rows]).T
+        """Middle (s), number of samples and length (s) of each window."""
+        self.kinds, self.keys = [row.kind for row in rows], [(row.session, row.time) for row in rows]
+        """Kind, and (recording, middle in s), of each window."""
+        self.sessions = sessions_of(rows)
         """Indices of each recording's windows in order of time."""
-        return sessions_of(self.accumulator.rows)
-
-    @cached_property
-    def keys(self) -> list[tuple[int, float]]:
-        """(Recording, middle in s) of each window."""
-        return [(row.session, row.time) for row in self.accumulator.rows]
 
     def misfit(self, sensor: str, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return output minus prediction of rows ``[columns | output]``, shape (k, 3)."""

@@ -88,12 +88,10 @@ def test_terms_and_reasons_pass_through_the_file(by_table):
 def test_offsets_of_windows_are_a_term_apart_from_white_noise(by_table):
     """Without bias processes, offsets and differences between recordings the second term vanishes."""
     from imu_calibration.estimation.solver import solve
-    from imu_calibration.estimation.weighted_system import make_prior
     solution, accumulator = by_table.solution, by_table.gathered.accumulator
     white = {sensor: replace(noise, offset_sd=0.0, bias_processes=()) for sensor, noise in solution.noise.items()}
     walking = {sensor: replace(noise, offset_sd=1e-2) for sensor, noise in white.items()}
-    first, second = (solve(accumulator, by_table.gathered_model, prior=make_prior(by_table.gathered_model), noise=each)
-                     for each in (white, walking))
+    first, second = (solve(accumulator, by_table.gathered_model, noise=each) for each in (white, walking))
     scale = np.diag(first.terms[SAMPLE_NOISE])
     assert np.all(np.abs(np.diag(first.terms[BIAS_PROCESS])) <= 1e-6 * scale)
     bias = first.model.slices['accelerometer', 'bias']

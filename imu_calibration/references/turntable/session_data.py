@@ -204,7 +204,7 @@ def _linearised(blocks, solution, prior):
     n_params, rows = len(solution.values), []
     for block in blocks:
         if block.accumulator.rows:
-            system = WeightedSystem(block.accumulator, solution.model, prior)
+            system = WeightedSystem(block.accumulator, solution.model)
             factors = {sensor: system.factors(sensor, solution.noise[sensor]) for sensor in SENSORS}
             residuals = system.residuals(solution.values, factors)[:-len(prior.root)]
             rows.append(np.column_stack([system.jacobian(solution.values, factors), residuals]))
