@@ -144,7 +144,7 @@ def print_designs():
 def print_static_navigation(rng):
     heading('Figures 6 and 7, 50 s at rest after six-position calibration (printed: 4 -> 0.02 m/s, 100 -> 0.3 m)')
     for drift in (0.0, 0.02, 0.05, 0.1, 0.75):
-        v0, p0, v1, p1 = zhang_claims.static_navigation(TABLE, 1e-3 * drift, rng, n_draws=200).medians()
+        v0, p0, v1, p1 = zhang_claims.static_navigation(TABLE, 1e-3 * drift, rng, n_draws=200)
         print(f'bias drift between runs {drift:4.2f} mg: {v0:.2f} -> {v1:.3f} m/s ({v0 / v1:5.1f}x), {p0:.0f} -> {p1:.2f} m '
               f'({p0 / p1:5.1f}x)')
 

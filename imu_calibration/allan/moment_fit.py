@@ -233,6 +233,8 @@ TAIL = 0.025
 """Probability beyond each end."""
 MAX_LOG_RATIO = 20.0
 """Largest logarithm of an end over the estimate."""
+LOG_TIME_STEP = 0.02
+"""Step of the derivative by the logarithm of a correlation time."""
 INTERVAL_ACCURACY_SDS = 0.02
 """Accuracy of the ends, in standard deviations."""
 
@@ -357,10 +359,10 @@ class _ScoreOfTime(_Score):
         return fit, _by_time(self.moments, value), [design[:, k] for k in range(len(processes)) if fit.coefficients[k] > 0]
 
 
-def _by_time(moments, time, step=0.02):
-    """Return the change of the Gauss-Markov curve with the logarithm of its time."""
-    late, early = (moments.design((gauss_markov(time * factor),))[:, 0] for factor in (1 + step, 1 - step))
-    return (late - early) / (2 * step)
+def _by_time(moments, time):
+    """Return the derivative of the Gauss-Markov curve by the logarithm of its time, by a central difference."""
+    late, early = (moments.design((gauss_markov(time * factor),))[:, 0] for factor in (1 + LOG_TIME_STEP, 1 - LOG_TIME_STEP))
+    return (late - early) / (2 * LOG_TIME_STEP)
 
 
 def _tails(moments, fit, direction, others, excess):

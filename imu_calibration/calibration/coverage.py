@@ -1,6 +1,5 @@
 """Coverage of directions by a calibration, and the state of each effect."""
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -12,7 +11,7 @@ from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.observability import MOTIONS, TABLE_MOTIONS, added_information, rest_with_up
+from imu_calibration.estimation.observability import ALL_MOTIONS, DIRECTIONS, MOTIONS, added_information, rest_with_up
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import DETERMINED, LACKING
 from imu_calibration.estimation.weighted_system import GAUGE_SD, make_prior
@@ -71,13 +70,10 @@ def group_states(result: CalibrationResult) -> list[GroupState]:
 
 def waiting_groups(model: SensorModel) -> list[GroupState]:
     """Return the GroupState of every effect of a model without data."""
-    texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
-    return [GroupState(e.sensor, e.name, Progress.WAITING, e.param_names()[0], float('nan'), e.tolerance, e.unit_of(0), texts[e.motion[0]])
-            for e in model.effects]
+    return [GroupState(e.sensor, e.name, Progress.WAITING, e.param_names()[0], float('nan'), e.tolerance, e.unit_of(0),
+                       ALL_MOTIONS[e.motion[0]]) for e in model.effects]
 
 
-DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)])
-"""Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""
 MIN_CELL_WORTH = 0.02
 """A cell with a gain below this share of the excess is not proposed for a pose."""
 MAX_MOTIONS_AHEAD, MIN_MOTION_GAIN = 20, 0.01

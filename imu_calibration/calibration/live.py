@@ -68,7 +68,9 @@ class LiveCalibration:
         self.result: TableResult | None = None
         self.last: LiveSnapshot | None = None
         """The data of the last solution."""
-        self._too_far, self._designs = False, {}
+        self.needs_linearising = False
+        """Whether the last solution is outside the validity of its linearisation, and the store is too small to linearise again."""
+        self._designs: dict[Window, tuple[slice, dict[str, np.ndarray]]] = {}
         if saved is not None and self._asked.needs_temperature:
             self._first_temperature_c = collector.saved_model(saved).temperature_ref_c
             self._begin(self._asked.with_reference_temperature(self._first_temperature_c), saved)
@@ -196,7 +198,7 @@ class LiveCalibration:
         solution, total, model = snapshot.solved(options)
         self.result = conclude(self.extension.applied(solution), total, model, table=self.table, options=options, provenance=provenance,
                                changes=self.extension.changes)
-        self.last, self._too_far = snapshot, linearise_again(model, solution) is not None
+        self.last, self.needs_linearising = snapshot, linearise_again(model, solution) is not None
         return self.result
 
     def adopt(self, extension: ModelExtension) -> bool:
@@ -216,10 +218,6 @@ class LiveCalibration:
             self._designs = {}
         self.extension = extension
         return True
-
-    def needs_linearising(self) -> bool:
-        """Return whether the last solution is outside the validity of its linearisation, and the store is too small to linearise again."""
-        return self._too_far
 
     def gathered(self, pending: bool = False) -> SessionData:
         """Return all gathered data, an earlier run included, to be saved."""

@@ -83,6 +83,7 @@ class LiveByHand:
 
     observations = HandResult.observations
     needs_joints, on_table = False, None
+    needs_linearising = False   # the solution is iterated to its end
     needs_temperature = False   # no temperatures are kept with the poses
 
     @property
@@ -185,10 +186,6 @@ class LiveByHand:
         recording = HandRecording(imu, None, self.counts)
         self.result = evident_result(recording, self.options, provenance, stills=self.found.rests)[0]
         return self.result
-
-    def needs_linearising(self) -> bool:
-        """Return False: the solution is iterated to its end."""
-        return False
 
     def saved(self, pending: bool = False) -> bytes:
         """Return the samples as bytes, for `saved` of another run."""

@@ -209,7 +209,7 @@ class CheckResult:
     proof: dict
     """Sensor -> error before and after, interval and amount of data, by regime (see `proof.prove`); {}: not determined."""
     findings: tuple = ()
-    """PoseScan of the checks of the recording."""
+    """Findings of the checks of the recording."""
     why: str = 'fewer than three windows of rest or motion were found; record for longer'
     """Why there is no proof, where there is none."""
     notes: tuple[str, ...] = ()

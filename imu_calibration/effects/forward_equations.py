@@ -1,6 +1,7 @@
 """The columns of a model over a motion, predicted readings, and the model applied to samples."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -64,15 +65,13 @@ def _shifted_by(lags, motion, roughly):
 
 
 def mean_reference(weighted: Sequence[tuple[float, Reference]], motion: JointMotion) -> Reference:
-    """Return the weighted mean of references (a lag is a mean over delays); attitude from the last, which moves little."""
+    """Return the weighted mean of references (a lag is a mean over delays)."""
     if len(weighted) == 1:
         return weighted[0][1]
     total = sum(weight for weight, _ in weighted)
-    first = weighted[0][1]
-    mean = {name: sum(weight * getattr(ref, name) for weight, ref in weighted) / total for name in ('force_s', 'rate_s', 'alpha_s',
-                                                                                                    'mat_sn')}
-    return Reference(motion.time, mean['mat_sn'], mean['force_s'], mean['rate_s'], mean['alpha_s'], first.gravity, first.temperature_c,
-                     motion.thermal_branch, motion.vibration, motion)
+    mean: dict[str, Any] = {name: sum(weight * getattr(ref, name) for weight, ref in weighted) / total
+                            for name in ('force_s', 'rate_s', 'alpha_s', 'mat_sn')}
+    return replace(weighted[0][1], motion=motion, **mean)
 
 
 INPUT_OF = {'accelerometer': 'force_s', 'gyroscope': 'rate_s'}
@@ -252,8 +251,7 @@ def predict(model: SensorModel, values: np.ndarray, table: Table, *, motion: Joi
     outputs = []
     for sensor in SENSORS:
         ref = warped_reference(exact, sensor, table, motion=motion, temperature_c=temperature_c)
-        output = columns_at_point(exact, sensor, ref) @ coefficients_at_point(exact, sensor, values)
-        outputs.append(clip(exact, sensor, values, output=output))
+        outputs.append(clip(exact, sensor, values, output=sensor_output(exact, sensor, values, ref=ref)))
     return outputs[0], outputs[1]
 
 

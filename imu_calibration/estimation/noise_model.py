@@ -9,6 +9,8 @@ from imu_calibration.core.units import STANDARD_GRAVITY
 
 HOUR = 3600.0
 """s; sessions are hardly longer, and changes of a bias over days are constant within a session."""
+SAME_VARIANCE = 0.05
+"""Relative change of variance up to which two noise models weigh rows alike."""
 DOF_FACTOR_MOST = 3.0
 """Largest factor by which a variance grows because it was itself estimated."""
 
@@ -172,15 +174,15 @@ class NoiseModel:
                   factors in moving.items()}
         return replace(self, moving=moving, offset_sd=0.0, bias_processes=processes)
 
-    def weighs_alike(self, other: 'NoiseModel', change: float = 0.05) -> bool:
-        """Return whether slow parts count no more than fast ones, or the weights equal `other` within a relative change of variance."""
+    def weighs_alike(self, other: 'NoiseModel') -> bool:
+        """Return whether slow parts count no more than fast ones, or the weights equal those of `other` within `SAME_VARIANCE`."""
         for kind, mine in self.moving.items():
             if np.all(mine.slow == mine.every):
                 continue
             if kind not in other.moving:
                 return False
             its, unit = other.moving[kind], self.low_variance / other.low_variance
-            if any(np.any(np.abs(unit * a / b - 1) > change) for a, b in ((mine.every, its.every), (mine.slow, its.slow))):
+            if any(np.any(np.abs(unit * a / b - 1) > SAME_VARIANCE) for a, b in ((mine.every, its.every), (mine.slow, its.slow))):
                 return False
         return True
 

@@ -1,10 +1,12 @@
 """Observability of parameters in standard motions."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
@@ -48,8 +50,7 @@ def _turn(axis, time, angle, rate, alpha, gravity, up, temperature_c=None, arm=N
           shaking=None):
     """Return the reference of a sensor that turns about its own `axis`; `up` is the vertical in the sensor at angle zero."""
     axis, up = np.asarray(axis, float) / np.linalg.norm(axis), np.asarray(up, float) / np.linalg.norm(up)
-    cos, sin = np.cos(angle)[:, None], -np.sin(angle)[:, None]
-    up_s = up * cos + np.cross(axis, up) * sin + axis * (axis @ up) * (1 - cos)
+    up_s = Rotation.from_rotvec(-angle[:, None] * axis).apply(up)
     rate_s, alpha_s = rate[:, None] * axis, alpha[:, None] * axis
     force = gravity * up_s
     if arm is not None:
@@ -67,9 +68,10 @@ def _attitudes(up_s):
 
 
 MOTION_TIME = np.arange(0.0, 30.0, 0.02)
-
-
-POSE_DIRECTIONS = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
+DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)])
+"""Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""
+FACES = [sign * row for row in np.eye(3) for sign in (1, -1)]
+"""The six faces turned up, in the sensor frame."""
 
 
 def _spin(axis, speeds, up=None, arm=None):
@@ -102,12 +104,12 @@ def _shaken(gravity):
     """Rest in six faces, quiet and while the sensor is shaken along each axis."""
     one, shakes = np.zeros(1), (np.zeros(3), *VIBRATION_VARIANCE * np.eye(3))
     return [_turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, shaking=shaking)
-            for shaking in shakes for k, up in enumerate(sign * row for row in np.eye(3) for sign in (1, -1))]
+            for shaking in shakes for k, up in enumerate(FACES)]
 
 
-def rest_with_up(up: tuple | np.ndarray) -> 'Motion':
+def rest_with_up(up: np.ndarray) -> 'Motion':
     """Return the motion of a rest with one direction of the sensor up."""
-    return Motion('rest', 'rest', _poses([tuple(up)]))
+    return Motion('rest', 'rest', _poses([up]))
 
 
 def _two_axis(gravity):
@@ -128,8 +130,7 @@ def _two_axis(gravity):
 
 def _fine_poses():
     angle = np.arange(0, 2 * np.pi, np.pi / 12)
-    rings = [np.roll(np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), k, axis=1) for k in range(3)]
-    return [tuple(v) for v in np.concatenate(rings)]
+    return np.concatenate([np.roll(np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), k, axis=1) for k in range(3)])
 
 
 SPINS = (-200, -100, 100, 200)
@@ -148,7 +149,7 @@ def _oscillates_about(axis, up=None):
 
 
 MOTIONS = (
-    Motion('static_poses', 'rest in six faces and twelve edge positions, at several headings', _poses(POSE_DIRECTIONS)),
+    Motion('static_poses', 'rest in six faces and twelve edge positions, at several headings', _poses(DIRECTIONS)),
     Motion('static_dense', 'rest every 15 degrees on three rings', _poses(_fine_poses())),
     *(_spins_about(axis) for axis in AXIS_DIRECTIONS),
     Motion('three_speeds', 'spin about skewed axes at 50, 100 and 200 deg/s in both senses', lambda g: [
@@ -159,9 +160,9 @@ MOTIONS = (
     Motion('centrifuge', 'spin at 300 deg/s on an arm of 0.3 m, about each axis', lambda g: [
         piece for k in range(3) for piece in _spin(np.eye(3)[k], (-300, 300), arm=0.3 * np.roll(np.eye(3)[k], 1))(g)]),
     Motion('warm_up', 'rest in six faces, cold and warm',
-           _poses([tuple(s * np.eye(3)[k]) for k in range(3) for s in (1, -1)], (15.0, 25.0, 35.0))),
+           _poses(FACES, (15.0, 25.0, 35.0))),
     Motion('warm_and_cool', 'rest in six faces while it warms up by ten kelvins, and again while it cools',
-           _poses([tuple(s * np.eye(3)[k]) for k in range(3) for s in (1, -1)], (20.0, 25.0, 30.0, 25.0, 20.0))),
+           _poses(FACES, (20.0, 25.0, 30.0, 25.0, 20.0))),
     Motion('shake', 'rest in six faces, quiet and while a machine shakes the sensor along each axis', _shaken),
 )
 """Standard motions of the sensor; motions of table joints are named by the effects that need them."""
@@ -194,6 +195,8 @@ TABLE_MOTIONS = {
     'fast_spin': 'spin slowly up to the fastest rate in both senses',
 }
 """Motions that concern the table or the clock; their gain depends on the table and is not predicted."""
+ALL_MOTIONS = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
+"""Name -> instruction."""
 ONE_JOINT = {
     'oscillate_fast': 'oscillate at 1, 2 and 4 Hz',
     'fast_spin': TABLE_MOTIONS['fast_spin'],
@@ -298,25 +301,19 @@ def needed_motions(solution: Solution, tolerances: np.ndarray, gravity: float, *
     for motion in MOTIONS if possible is None else possible:
         total = base + added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=gravity)
         predicted[motion] = _sd_of(total) * np.maximum(solution.sd / before, 1.0)   # the model error remains
-    best = _best if possible is None else _best_on_one_joint
-    return {solution.param_names[k]: best(solution, k, predicted) for k in lacking}
+    return {solution.param_names[k]: _best(solution, k, predicted, one_joint=possible is not None) for k in lacking}
 
 
 def _sd_of(information):
     return np.sqrt(np.clip(np.diag(inverse_normal(information)), 1e-300, None))
 
 
-def _best_on_one_joint(solution, index, predicted):
+def _best(solution, index, predicted, one_joint):
+    """Return (text, predicted sd) of the best motion; where none helps, another mount or the motion of the effect, and NaN."""
     motion = min(predicted, key=lambda m: predicted[m][index], default=None)
-    sd = float('nan') if motion is None else float(predicted[motion][index])
-    return (motion.text, sd) if sd < 0.7 * solution.sd[index] else (OTHER_MOUNT, float('nan'))
-
-
-def _best(solution, index, predicted):
-    motion = min(predicted, key=lambda m: predicted[m][index])
-    sd = float(predicted[motion][index])
-    if sd > 0.7 * solution.sd[index]:
-        owner = next(e for e in solution.model.effects if solution.param_names[index] in e.param_names())
-        texts = {m.name: m.text for m in MOTIONS} | TABLE_MOTIONS
-        return texts[owner.motion[0]], float('nan')
-    return motion.text, sd
+    if motion is not None and predicted[motion][index] <= 0.7 * solution.sd[index]:
+        return motion.text, float(predicted[motion][index])
+    if one_joint:
+        return OTHER_MOUNT, float('nan')
+    owner = next(e for e in solution.model.effects if solution.param_names[index] in e.param_names())
+    return ALL_MOTIONS[owner.motion[0]], float('nan')

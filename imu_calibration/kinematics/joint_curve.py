@@ -19,8 +19,6 @@ from imu_calibration.kinematics.smoothing import (
     smooth,
 )
 
-ROBUSTNESS = 0.7
-"""Guard against rough fits when the smoothing is chosen: larger values admit rough accelerations, smaller ones round sharp ramps."""
 VELOCITY_SCALE = 2e-3
 """Joint velocities are used when their scale agrees with the positions to this; filtered velocities distort the reference."""
 VELOCITY_LAG = 2e-4
@@ -61,7 +59,7 @@ def fit_with_velocity(rows: JointRows, fit: Smooth, position: np.ndarray, *, vel
         return fit
     weight = np.where(np.isfinite(velocity), fit.noise_sd / velocity_sd, 0.0)
     rest = position - trend.at(rows.time)[:, 0], weight * (np.nan_to_num(velocity) - trend.at(rows.time, 1)[:, 0])
-    better, = smooth(rows.both(weight), np.concatenate(rest)[:, None], [fit.noise_sd], robustness=ROBUSTNESS)
+    better, = smooth(rows.both(weight), np.concatenate(rest)[:, None], [fit.noise_sd])
     return better
 
 
@@ -217,7 +215,7 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
     moving = np.flatnonzero(~still).tolist()
     if len(stamps) >= _MINIMUM_SAMPLES and len(moving):
         rows = JointRows(knots, time)
-        fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving], robustness=ROBUSTNESS)
+        fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving])
         for joint, fit in zip(moving, fits, strict=True):
             noise[joint] = max(floor[joint], fit.noise_sd)
             if velocity is not None:

@@ -125,6 +125,8 @@ def _horner(pieces, interval, place, taylor):
 
 # Decades of the penalty relative to the rows per knot: from interpolation to a bandwidth of 1/100 of Nyquist's.
 _COARSE = (-6.0, -3.0, 0.0, 3.0, 6.0, 9.0)
+ROBUSTNESS = 0.7
+"""Parameter gamma of the robust criterion: 1 for plain cross-validation, less for fits that round sharp ramps more."""
 _PILOT = -2.0  # rough, but tame where readings lie close together
 _TAPER = 0.2  # share of a record in which the weight of the ends rises
 _LONG = 1000  # rows from which on the spectrum gives the residuals
@@ -219,7 +221,7 @@ class PenalisedSpline:
         return self._theta[np.searchsorted(penalty * damping / normal, 1.0) - 1]
 
 
-def smooth(spline: PenalisedSpline, values: np.ndarray, noise_floor: Sequence[float] | np.ndarray, *, robustness: float) -> list[Smooth]:
+def smooth(spline: PenalisedSpline, values: np.ndarray, noise_floor: Sequence[float] | np.ndarray) -> list[Smooth]:
     """
     Return a `Smooth` per column of `values`, with the penalty that predicts best.
 
@@ -234,13 +236,11 @@ def smooth(spline: PenalisedSpline, values: np.ndarray, noise_floor: Sequence[fl
         Right-hand sides.
     noise_floor : array, shape (n_joints,)
         Standard deviation that the noise has at least.
-    robustness : float
-        Parameter gamma of the robust criterion: one for plain cross-validation, less for smoother fits.
 
     """
     squares = (_squares_by_spectrum if spline.n_rows >= _LONG else _squares_by_fits)(spline, values)
-    decades = [_best_decade((lambda decade, c=column: _cross_validation(spline, decade, squares(decade)[c], robustness),
-                             lambda decade, c=column, f=floor: _mallows(spline, decade, squares(decade)[c], f, robustness)))
+    decades = [_best_decade((lambda decade, c=column: _cross_validation(spline, decade, squares(decade)[c]),
+                             lambda decade, c=column, f=floor: _mallows(spline, decade, squares(decade)[c], f)))
                for column, floor in enumerate(noise_floor)]
     results = {}
     for decade in set(decades):
@@ -296,15 +296,15 @@ def _penalty(spline, decade):
     return spline.density * 10.0 ** max(decade, spline.least_decade)
 
 
-def _cross_validation(spline, decade, squares, robustness):
+def _cross_validation(spline, decade, squares):
     gain, square = spline.gains(_penalty(spline, decade))
-    return squares / (1 - gain) ** 2 * (robustness + (1 - robustness) * square)
+    return squares / (1 - gain) ** 2 * (ROBUSTNESS + (1 - ROBUSTNESS) * square)
 
 
-def _mallows(spline, decade, squares, noise_sd, robustness):
+def _mallows(spline, decade, squares, noise_sd):
     gain, _ = spline.gains(_penalty(spline, decade))
     # The guard of the robust criterion, to first order in the gain.
-    return squares + (1 + 1 / robustness) * noise_sd ** 2 * gain
+    return squares + (1 + 1 / ROBUSTNESS) * noise_sd ** 2 * gain
 
 
 def _best_decade(scores):

@@ -269,7 +269,7 @@ class CalibrationWorker(threading.Thread):
         judged, complete = ('', False) if result is None else (result.verdict.text, result.verdict.complete)
         values = {self.gathered: self.live.n_windows, 'solutions': self._n_solutions, 'saves to': str(self.place.calibration),
                   f'{self.gathered} in no file yet': self.place.unsaved(self.live), 'process': os.getpid(), **counts}
-        if self.live.needs_linearising():
+        if self.live.needs_linearising:
             lines = [*lines, 'an effect is outside the range of its linearisation and the stored windows are no longer available: '
                      'calibrate the recording offline']
         stale = self.state.solution != self._n_solutions or self.state.groups == [] or result is None

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.rotations import skew
 from imu_calibration.papers.linear_least_squares import LinearSolution, solve_linear
 
 MODEL_COLUMNS = {
@@ -50,16 +50,12 @@ def turn(order: str, angles: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         Turns in rad, right-handed, each about the axis as the previous turns left it.
 
     """
-    first, second, third = (_axis_turn('XYZ'.index(letter), angle) for letter, angle in zip(order, angles, strict=True))
-    return third @ second @ first
+    return Rotation.from_euler(order, np.transpose(angles)).inv().as_matrix()
 
 
 def simultaneous_turn(angle: np.ndarray, axis: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> np.ndarray:
     """Return body-from-base matrices of one turn by `angle` (rad, shape (n,)) about `axis`: "three axes simultaneously", literally."""
-    axis = np.asarray(axis, float) / np.linalg.norm(axis)
-    cross = skew(axis)
-    angle = np.asarray(angle, float)[:, None, None]
-    return np.eye(3) - np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+    return Rotation.from_rotvec(np.outer(angle, axis) / np.linalg.norm(axis)).inv().as_matrix()
 
 
 def equal_angles(step_deg: float = 10.0, stop_deg: float = 400.0) -> np.ndarray:
@@ -81,7 +77,8 @@ def gravity_readings(mat_bn: np.ndarray, gravity_axis: str, tilt_rad: Sequence[f
         Levelling error: components of the unit gravity vector along the next two base axes.
 
     """
-    return mat_bn @ tilted_gravity(gravity_axis, tilt_rad)
+    up, *level = np.roll(np.eye(3), -'xyz'.index(gravity_axis), axis=0)
+    return mat_bn @ (np.sqrt(1 - np.dot(tilt_rad, tilt_rad)) * up + np.dot(tilt_rad, level))
 
 
 def series_3() -> np.ndarray:
@@ -149,22 +146,6 @@ def calibrate_as_printed(inputs: np.ndarray, outputs: np.ndarray, model: str = '
     """Return X by the printed normal equations ``inv(G'G) G'U``, to show what they lose."""
     design = design_matrix(inputs, model)
     return np.linalg.inv(design.T @ design) @ design.T @ outputs
-
-
-def _axis_turn(axis, angle):
-    cosine, sine = np.cos(angle), np.sin(angle)
-    matrix = np.zeros(np.shape(angle) + (3, 3))
-    following, last = (axis + 1) % 3, (axis + 2) % 3
-    matrix[..., axis, axis] = 1.0
-    matrix[..., following, following] = matrix[..., last, last] = cosine
-    matrix[..., following, last], matrix[..., last, following] = sine, -sine
-    return matrix
-
-
-def tilted_gravity(gravity_axis: str, tilt_rad: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return the unit gravity reaction in the base frame, shape (3,); `tilt_rad` are its components along the next two axes."""
-    up, first, second = np.roll(np.eye(3), -'xyz'.index(gravity_axis), axis=0)
-    return np.sqrt(1 - np.dot(tilt_rad, tilt_rad)) * up + tilt_rad[0] * first + tilt_rad[1] * second
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,8 +275,8 @@ def encoder_changes(order: str, angles: np.ndarray, gravity_axis: str, *, encode
 
 
 def _tilt_derivative(gravity_axis, tilt_rad):
-    up, first, second = np.roll(np.eye(3), -'xyz'.index(gravity_axis), axis=0)
-    return np.column_stack([first, second]) - np.outer(up, tilt_rad) / np.sqrt(1 - np.dot(tilt_rad, tilt_rad))
+    up, *level = np.roll(np.eye(3), -'xyz'.index(gravity_axis), axis=0)
+    return np.column_stack(level) - np.outer(up, tilt_rad) / np.sqrt(1 - np.dot(tilt_rad, tilt_rad))
 
 
 def _design_slope(inputs, model):

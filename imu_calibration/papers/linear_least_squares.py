@@ -82,7 +82,7 @@ def solve_linear(design: np.ndarray, outputs: np.ndarray, param_names: tuple[str
 def numerical_rank(design: np.ndarray) -> int:
     """Return the rank of `design` after its columns are scaled to unit norm; zero columns count as zero."""
     singular = _scaled_svd(np.asarray(design, float))[2]
-    return int(np.sum(singular > RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)))
+    return int(np.sum(~_unseen(singular)))
 
 
 def condition_numbers(design: np.ndarray) -> tuple[float, float]:
@@ -100,7 +100,7 @@ def null_directions(design: np.ndarray, param_names: tuple[str, ...]) -> list[di
 
     """
     norms, _, singular, right = _scaled_svd(np.asarray(design, float))
-    weak = right[singular <= RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)]
+    weak = right[_unseen(singular)]
     return [] if len(weak) == 0 else _echelon(weak, norms, tuple(param_names))
 
 
@@ -121,7 +121,7 @@ def predicted_sd(design: np.ndarray, weights: np.ndarray | None = None, sigma: f
     if weights is not None:
         design = design * np.sqrt(np.asarray(weights, float))[:, None]
     norms, _, singular, right = _scaled_svd(design)
-    weak = singular <= RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)
+    weak = _unseen(singular)
     reach = np.sqrt(np.sum((right[~weak].T / singular[~weak]) ** 2, axis=1)) / norms
     touched = np.any(np.abs(right[weak]) > 1e-7, axis=0)
     return np.where(touched, np.inf, sigma * reach)
@@ -192,6 +192,11 @@ def _scaled_svd(design):
     return norms, (orthogonal @ left)[:len(design)], singular, right
 
 
+def _unseen(singular):
+    """Return which of the descending singular values count as zero."""
+    return singular <= RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)
+
+
 def _padded(design):
     missing = design.shape[1] - design.shape[0]
     return np.vstack([design, np.zeros((missing, design.shape[1]))]) if missing > 0 else design
@@ -202,7 +207,7 @@ def _ratio(singular):
 
 
 def _require_full_rank(design, norms, singular, right, names):
-    weak = singular <= RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)
+    weak = _unseen(singular)
     if np.any(weak):
         directions = _echelon(right[weak], norms, names)
         raise NotObservableError(

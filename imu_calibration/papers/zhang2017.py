@@ -12,7 +12,6 @@ from imu_calibration.kinematics import strapdown
 from imu_calibration.kinematics.rotations import lever_matrix
 from imu_calibration.papers.linear_least_squares import LinearSolution, solve_linear
 
-"""m/s^2, the g of the paper's units."""
 TABLE_1_ANGLES_DEG = np.array([[0.75997, 90.71425, 89.74038], [89.25516, 0.74486, 90.5630], [90.52202, 89.17706, 0.97456]])
 """Installation angles as printed, row i: sensor axis i to body x, y, z."""
 TABLE_1_SCALE = np.array([0.39496, 0.39808, 0.40024])
@@ -223,29 +222,12 @@ def axis_readings(measured: np.ndarray, compensated: np.ndarray, reference: np.n
     return lines
 
 
-@dataclass(frozen=True, eq=False)
-class StaticNavigation:
-    """Sizes of the 3D errors after navigating at rest, one entry per draw."""
-
-    velocity_before: np.ndarray
-    """m/s, installation angles ignored, shape (n_draws,)."""
-    position_before: np.ndarray
-    """m, shape (n_draws,)."""
-    velocity_after: np.ndarray
-    """m/s, after six-position calibration, shape (n_draws,)."""
-    position_after: np.ndarray
-    """m, shape (n_draws,)."""
-
-    def medians(self) -> tuple[float, ...]:
-        """Return medians: velocity before, position before, velocity after, position after."""
-        return tuple(float(np.median(values)) for values in
-                     (self.velocity_before, self.position_before, self.velocity_after, self.position_after))
-
-
 def static_navigation(model: StaticModel, drift_sd_g: float, rng: np.random.Generator, *, n_draws: int = 400, seconds: float = 50.0,
-                      noise_sd_g: float = 1e-3, sample_rate: float = 100.0, calibration_seconds: float = 60.0) -> StaticNavigation:
+                      noise_sd_g: float = 1e-3, sample_rate: float = 100.0, calibration_seconds: float = 60.0) -> np.ndarray:
     """
-    Calibrate in six positions, then navigate at rest with x up, attitude known.
+    Return errors of navigation at rest with x up, attitude known: medians of velocity (m/s) and position (m), before and after calibration.
+
+    Before, the installation angles are ignored; after, the six-position calibration is used. Shape (4,).
 
     Parameters
     ----------
@@ -277,7 +259,7 @@ def static_navigation(model: StaticModel, drift_sd_g: float, rng: np.random.Gene
         constant = np.stack(strapdown.constant_error_growth(STANDARD_GRAVITY * error, seconds))
         scatter = np.linalg.solve(used_matrix[:, None], wander[..., None])[..., 0]
         ends.append(np.linalg.norm(constant + STANDARD_GRAVITY * np.moveaxis(scatter, 1, 0), axis=-1))
-    return StaticNavigation(*ends[0], *ends[1])
+    return np.median(np.concatenate(ends), axis=1)
 
 
 def _noise_at_end(rng, noise_sd, seconds, sample_rate):

@@ -8,7 +8,7 @@ import numpy as np
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.effects.base import AXES, PREFIXES, SENSORS, Effect
 from imu_calibration.effects.catalogue import term
-from imu_calibration.estimation.observability import MOTIONS, TABLE_MOTIONS
+from imu_calibration.estimation.observability import ALL_MOTIONS
 from imu_calibration.selection.explained_share import MIN_SMOOTH_SHARE
 from imu_calibration.selection.formulas import FormulaChoice, FormulaSearch, grammar
 from imu_calibration.selection.linearised_problem import LinearisedProblem
@@ -258,8 +258,7 @@ def _size(effect, values, sd):
 
 
 def _motion(effects):
-    texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
-    return '; '.join(dict.fromkeys(texts[name] for effect in effects for name in effect.motion[:1] if name in texts))
+    return '; '.join(dict.fromkeys(ALL_MOTIONS[name] for effect in effects for name in effect.motion[:1] if name in ALL_MOTIONS))
 
 
 def _nearest(fits: BlockFits, plain: BlockFit, problem: LinearisedProblem) -> tuple[str, float] | None:

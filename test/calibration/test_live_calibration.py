@@ -124,14 +124,14 @@ def test_a_tilted_table_is_linearised_anew_like_offline(tilted):
     tilt = expected.calibration.value('reference', 'table_tilt')
     assert np.all(np.abs(tilt - [0.004, -0.003]) < 4 * expected.calibration.sd[expected.model.slices['reference', 'table_tilt']])
     assert_same(live.solve(pending=True).calibration, expected.calibration)
-    assert not live.needs_linearising()
+    assert not live.needs_linearising
 
 
 def test_a_store_too_small_is_said_and_still_gives_the_first_pass(tilted):
     live = LiveCalibration(TABLE, settings=LiveSettings(store_samples=100))
     run(live, *tilted)
     result = live.solve(pending=True)
-    assert live.needs_linearising() and not live._collector.store.complete
+    assert live.needs_linearising and not live._collector.store.complete
     tilt = result.calibration.value('reference', 'table_tilt')
     assert np.all(np.abs(tilt - [0.004, -0.003]) < 6 * result.calibration.sd[result.model.slices['reference', 'table_tilt']] + 1e-5)
 

@@ -9,7 +9,7 @@ from imu_calibration.calibration.diagnosis.diagnosis_result import Candidate, Fi
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.document.calibration import beyond_known
 from imu_calibration.effects.base import SENSORS, Effect
-from imu_calibration.estimation.observability import MOTIONS, ONE_JOINT, OTHER_MOUNT, TABLE_MOTIONS, added_information
+from imu_calibration.estimation.observability import ALL_MOTIONS, MOTIONS, ONE_JOINT, OTHER_MOUNT, added_information
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.gain import Gain
@@ -53,8 +53,7 @@ def separating_motion(solution: Solution, question: Question, mate: Question, *,
 
 def motions_of(question: Question, mate: Question) -> str:
     """Return the motions that two effects declare as theirs."""
-    texts = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
-    return '; '.join(dict.fromkeys(texts[name] for name in question.effect.motion + mate.effect.motion if name in texts))
+    return '; '.join(dict.fromkeys(ALL_MOTIONS[name] for name in question.effect.motion + mate.effect.motion if name in ALL_MOTIONS))
 
 
 def motions_of_one_joint(question: Question, mate: Question) -> str:
