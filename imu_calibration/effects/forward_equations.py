@@ -15,46 +15,6 @@ from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.table import Table
 
 
-def warped_reference(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
-                     values: dict[str, np.ndarray] | None = None, roughly: bool = False,
-                     shifts: dict[tuple, list] | None = None, attitude: bool = True) -> Reference:
-    """
-    Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
-
-    The motion is shifted once by the sum of all lags; errors of table and encoders act on the shifted motion.
-
-    Parameters
-    ----------
-    values : dict, optional
-        Effect name -> values that replace the point of the effect.
-    roughly : bool
-        Approximate a lag by a delay of the same first derivative; a filter averages several delays and costs as many times more.
-    shifts : dict, optional
-        Lags -> (weight, shifted motion) pairs of earlier calls with this motion; new ones are added.
-    attitude : bool
-        As in `reference_motion`.
-
-    """
-    acting = []
-    for effect in model.concerning(sensor):
-        at = (values or {}).get(effect.name)
-        at = model.point_of(effect) if at is None else np.atleast_1d(at)
-        if effect.warp is not None and np.any(at):
-            acting.append((effect.name, effect.warp, at))
-    lags = [(name, warp, at) for name, warp, at in acting if isinstance(warp, Lag)]
-    key, known = (roughly, *((name, *at) for name, _, at in lags)), {} if shifts is None else shifts
-    if key not in known:
-        known[key] = _shifted_by(lags, motion, roughly)
-    references = []
-    for weight, felt in known[key]:
-        there = table
-        for _, warp, at in acting:
-            if not isinstance(warp, Lag):
-                there, felt = warp(there, felt, at)
-        references.append((weight, reference_motion(there, felt, temperature_c, attitude=attitude)))
-    return mean_reference(references, motion)
-
-
 def _shifted_by(lags, motion, roughly):
     """Return (weight, motion) pairs: the motion at each sum of the delays of (name, Lag, values) triples."""
     delays = [(1.0, np.zeros(()))]
@@ -86,17 +46,46 @@ class References:
         self._shifts: dict[tuple, list] = {}
 
     def at(self, sensor: str, effect: Effect | None = None, values: np.ndarray | None = None, *, roughly: bool = False) -> Reference:
-        """Return the reference of `sensor`; with other values for one effect, without attitude; `roughly` as in `warped_reference`."""
-        acting = tuple(e.name for e in self.model.concerning(sensor) if e.warp is not None and np.any(self.model.point_of(e)))
-        change, moved = None, ()
-        if effect is not None and values is not None:
-            change = {effect.name: values}
-            moved = (effect.name, *values) if np.any(values != self.model.point_of(effect)) else ()
-        key = (roughly, acting, *moved)
+        """
+        Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
+
+        The motion is shifted once by the sum of all lags; errors of table and encoders act on the shifted motion.
+
+        Parameters
+        ----------
+        sensor : str
+        effect, values : Effect and array, optional
+            An effect with other values than its point; the reference is then without attitude.
+        roughly : bool
+            Approximate a lag by a delay of the same first derivative; a filter averages several delays and costs as many times more.
+
+        """
+        acting: list[tuple[str, Any, Any]] = []
+        moved = None
+        if effect is not None and values is not None and np.any(values != self.model.point_of(effect)):
+            moved = effect.key
+        for each in self.model.concerning(sensor):
+            at = values if each.key == moved else self.model.point_of(each)
+            if each.warp is not None and np.any(at):
+                acting.append((each.name, each.warp, at))
+        key = (roughly, moved, *((name, *at) for name, _, at in acting))
         if key not in self._known:
-            self._known[key] = warped_reference(self.model, sensor, self.table, motion=self.motion, temperature_c=self.temperature_c,
-                                                values=change, roughly=roughly, shifts=self._shifts, attitude=not moved)
+            self._known[key] = self._warped(acting, roughly, attitude=moved is None)
         return self._known[key]
+
+    def _warped(self, acting, roughly, attitude):
+        lags = [(name, warp, at) for name, warp, at in acting if isinstance(warp, Lag)]
+        key = (roughly, *((name, *at) for name, _, at in lags))
+        if key not in self._shifts:
+            self._shifts[key] = _shifted_by(lags, self.motion, roughly)
+        references = []
+        for weight, felt in self._shifts[key]:
+            table = self.table
+            for _, warp, at in acting:
+                if not isinstance(warp, Lag):
+                    table, felt = warp(table, felt, at)
+            references.append((weight, reference_motion(table, felt, self.temperature_c, attitude=attitude)))
+        return mean_reference(references, self.motion)
 
 
 def columns(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
@@ -248,11 +237,10 @@ def predict(model: SensorModel, values: np.ndarray, table: Table, *, motion: Joi
     Warps are exact at `values`; saturation clips the result.
     """
     exact = model.at(values)
-    outputs = []
-    for sensor in SENSORS:
-        ref = warped_reference(exact, sensor, table, motion=motion, temperature_c=temperature_c)
-        outputs.append(clip(exact, sensor, values, output=sensor_output(exact, sensor, values, ref=ref)))
-    return outputs[0], outputs[1]
+    references = References(exact, table, motion, temperature_c=temperature_c)
+    outputs = {sensor: sensor_output(exact, sensor, values, ref=references.at(sensor)) for sensor in SENSORS}
+    force, rate = (clip(exact, sensor, values, output=output) for sensor, output in outputs.items())
+    return force, rate
 
 
 def coefficients_at_point(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:

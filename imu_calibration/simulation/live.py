@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.forward_equations import clip, warped_reference
+from imu_calibration.effects.forward_equations import References, clip
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import lever_matrix
 from imu_calibration.kinematics.table import Table
@@ -101,7 +101,8 @@ class LiveSimulation:
         return felt.force, felt.rate
 
     def _truth(self, stamps, motion):
-        felt = [warped_reference(self.model, sensor, self.table, motion=motion) for sensor in SENSORS]
+        references = References(self.model, self.table, motion)
+        felt = [references.at(sensor) for sensor in SENSORS]
         force = felt[0].force_s
         arm = self.model.value('accelerometer', Role.ARM, self.values)
         if arm is not None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.forward_equations import INPUT_OF, warped_reference
+from imu_calibration.effects.forward_equations import INPUT_OF, References
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.strapdown import dead_reckoning_errors
@@ -269,7 +269,8 @@ def _variables(windows, table, model):
 
 def _references(model, table, motion, temperature):
     """Return sensor -> the Reference of its samples at the values of a model."""
-    return {s: warped_reference(model.model.at(model.values), s, table, motion=motion, temperature_c=temperature) for s in SENSORS}
+    references = References(model.model.at(model.values), table, motion, temperature_c=temperature)
+    return {sensor: references.at(sensor) for sensor in SENSORS}
 
 
 def _starts(windows):
