@@ -233,10 +233,9 @@ class Collector:
 
     def update_counts(self) -> None:
         """Bring the counts up to date."""
-        counts = dict(self.gatherer.counts)
-        for reason, count in self.gatherer.cleaner.lost.items():
-            counts[reason] = counts.get(reason, 0) + count
-        self.gathered.counts = counts
+        counts = Counter(self.gatherer.counts)
+        counts.update(self.gatherer.cleaner.lost)
+        self.gathered.counts = dict(counts)
 
     def _note_imu(self, imu):
         found = self.gathered

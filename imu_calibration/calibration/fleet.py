@@ -131,17 +131,15 @@ def summarise(results: Sequence[UnitResult]) -> list[Spread]:
     if not good:
         first = f'; the first, {results[0].name}: {results[0].error}' if results else ''
         raise InputError(f'at least one unit must be calibrated, none of {len(results)} was{first}', code='no_unit_calibrated')
-    values, order, units = {}, [], {}
+    values, units = {}, {}
     for unit, calibration in good:
         for effect in calibration.model.effects:
             units |= {name: effect.unit_of(k) for k, name in enumerate(effect.param_names())}
         for name, value, sd, status in zip(calibration.param_names, calibration.values, calibration.sd, calibration.status, strict=True):
-            if name not in values:
-                order.append(name)
-            values.setdefault(name, [])
+            found = values.setdefault(name, [])
             if status != HELD:
-                values[name].append((float(value), float(sd), unit))
-    return [_spread(name, units[name], values[name]) for name in order]
+                found.append((float(value), float(sd), unit))
+    return [_spread(name, units[name], found) for name, found in values.items()]
 
 
 def _spread(name, unit, found):

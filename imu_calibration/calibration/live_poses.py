@@ -2,6 +2,7 @@
 
 import copy
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -66,7 +67,7 @@ class LiveByHand:
         self.options, self.settings, self._clock = by_hand.at_place(options), settings, clock
         self._asked = hand_options(self.options)
         _check_model(self.model)
-        self._check, self._store, self._drops = StreamCheck(), HandStore(by_hand.hand_samples), {}
+        self._check, self._store, self._drops = StreamCheck(), HandStore(by_hand.hand_samples), Counter()
         if saved is not None:
             self._store.load(saved)
         self._pacer, self._unsearched, self._reported_ns = SolvePacer(SEARCH_SHARE), 0, None
@@ -115,15 +116,11 @@ class LiveByHand:
     @property
     def counts(self) -> dict[str, int]:
         """Unusable samples, by reason."""
-        counts = dict(self._drops)
-        for reason, count in self._check.counts.items():
-            counts[f'imu {reason}'] = counts.get(f'imu {reason}', 0) + count
-        return {reason: count for reason, count in counts.items() if count}
+        return dict(self._drops + Counter({f'imu {reason}': count for reason, count in self._check.counts.items()}))
 
     def push(self, block: SampleBlock) -> list[ImuSamples]:
         """Add arriving samples; return the poses completed since the last call, as mean ImuSamples, one each, in a list."""
-        for reason, count in (block.dropped or {}).items():
-            self._drops[reason] = self._drops.get(reason, 0) + count
+        self._drops.update(block.dropped or {})
         imu = block.imu
         if imu is None or not len(imu):
             return []
