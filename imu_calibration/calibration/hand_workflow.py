@@ -51,21 +51,6 @@ class HandResult(CalibrationResult):
     observations: ClassVar[str] = 'poses'
 
     @property
-    def reference(self) -> str:
-        """Gravity."""
-        return 'gravity, by hand'
-
-    @property
-    def gravity(self) -> float:
-        """The reference, m/s^2."""
-        return self.hand.gravity
-
-    @property
-    def period(self) -> float:
-        """Sampling period, s."""
-        return float(self.hand.statistics['period'])
-
-    @property
     def singular_values(self) -> np.ndarray:
         """Empty: the directions of the poses are estimated too."""
         return np.zeros(0)
@@ -212,8 +197,8 @@ def hand_result(evident: EvidentHand, recording: HandRecording, options: Calibra
                            proof=prove_by_hand(hand, hand.used_turns if turns else ()), changes=evident.changes,
                            uncorrected=uncorrected_by_hand(hand), tested=CROSS_TERMS)
     needed = {name: (item['needs'], float('nan')) for item in reversed(advice) for name in item['parameters']}
-    return HandResult(calibration=calibration, gathered=gathered, tolerances=hand.tolerances, needed=needed,
-                      options=options, hand=hand)
+    return HandResult(calibration=calibration, gathered=gathered, tolerances=hand.tolerances, needed=needed, options=options,
+                      reference='gravity, by hand', gravity=hand.gravity, period=float(hand.statistics['period']), hand=hand)
 
 
 def _statistics(hand, counts, n_samples):

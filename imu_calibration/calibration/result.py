@@ -69,6 +69,12 @@ class CalibrationResult(ABC):
     """Parameter that is not determined -> (the motion that would serve it best, its sd after a minute of that motion, NaN when unknown)."""
     options: CalibrationOptions = CalibrationOptions()
     """Options of the requested model."""
+    reference: str
+    """Short description of the reference of the sensor."""
+    gravity: float
+    """Gravity of the reference, m/s^2."""
+    period: float
+    """Sampling period, s."""
 
     observations: ClassVar[str]
     """Unit of the data: 'windows' or 'poses'."""
@@ -78,21 +84,6 @@ class CalibrationResult(ABC):
         """The decision per sensor with all statements."""
         assert self.calibration.judgement is not None, 'a result is made of a calibration that was judged'
         return self.calibration.judgement
-
-    @property
-    @abstractmethod
-    def reference(self) -> str:
-        """Short description of the reference of the sensor."""
-
-    @property
-    @abstractmethod
-    def gravity(self) -> float:
-        """Gravity of the reference, m/s^2."""
-
-    @property
-    @abstractmethod
-    def period(self) -> float:
-        """Sampling period, s."""
 
     @property
     @abstractmethod

@@ -186,8 +186,10 @@ def conclude(solution: Solution, gathered: SessionData, model: SensorModel, *, t
     calibration = document(solution, tolerances, gathered, gravity=table.gravity_value, gauge=gauge_of(solution.model),
                            undetermined=weak_on_table(solution, tolerances, needed), statistics=statistics(solution, gathered),
                            provenance=provenance, proof=proof, changes=changes, uncorrected=uncorrected)
-    return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options, solution=solution,
-                       table=table, model=solution.model, gathered_model=model)
+    period = float(np.median([row.duration / max(row.count - 1, 1) for row in gathered.accumulator.rows]))
+    return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options,
+                       reference=f'table with {len(table.joints)} joints ({", ".join(table.joint_names)})', gravity=table.gravity_value,
+                       period=period, solution=solution, table=table, model=solution.model, gathered_model=model)
 
 
 def _by_default(model, options):

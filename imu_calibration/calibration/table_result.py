@@ -220,21 +220,6 @@ class TableResult(CalibrationResult):
     observations: ClassVar[str] = 'windows'
 
     @property
-    def reference(self) -> str:
-        """The joints of the table."""
-        return f'table with {len(self.table.joints)} joints ({", ".join(self.table.joint_names)})'
-
-    @property
-    def gravity(self) -> float:
-        """Gravity of the table, m/s^2."""
-        return self.table.gravity_value
-
-    @property
-    def period(self) -> float:
-        """Median sampling period of the windows, s."""
-        return float(np.median([row.duration / max(row.count - 1, 1) for row in self.gathered.accumulator.rows]))
-
-    @property
     def singular_values(self) -> np.ndarray:
         """Singular values of the design in units of the tolerances; directions that the gauge fixes by convention are left out."""
         convention = make_prior(self.solution.model).root[len(self.tolerances):]

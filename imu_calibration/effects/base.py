@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -262,8 +263,8 @@ def _of_input(ending, texts):
 CONSTANT = ColumnGroup('one', ('1',))
 TIME = ColumnGroup('time', ('time',))
 TRUE_INPUT = _of_input('', lambda v: v)
-SQUARES = _of_input('_squares', lambda v: [f'{v[j]} * {v[k]}' for j, k in PRODUCT_PAIRS])
-CUBES = _of_input('_cubes', lambda v: [f'{v[i]} * {v[j]} * {v[k]}' for i, j, k in TRIPLES])
+SQUARES = _of_input('_squares', lambda v: [' * '.join(v[k] for k in product) for product in PRODUCT_PAIRS])
+CUBES = _of_input('_cubes', lambda v: [' * '.join(v[k] for k in product) for product in TRIPLES])
 SIGNED = _of_input('_signed', lambda v: [f'sign({vi}) * {vj}' for vi in v for vj in v])
 """Column 3 i + j: |u.v| for an input axis u close to axis i is sign(v_i) (u.v)."""
 THERMAL = _of_input('_temperature', lambda v: [f'{vi} * ({TEMPERATURE_RISE})' for vi in v])
@@ -286,15 +287,13 @@ CHANGE = {'accelerometer': ColumnGroup('force_change', ('f_y * w_z - f_z * w_y',
 WARM_UP = {sensor: ColumnGroup(f'{short}_warm_up', ('-expm1(-time / tau)',), f'{short}_bias_drift') for sensor, short in PREFIXES.items()}
 
 
-def square_coefficients(axes: np.ndarray) -> np.ndarray:
-    """Return the coefficients of `SQUARES` that give (u_i . v)^2 for each row u_i of `axes`, shape (6, 3)."""
-    return np.stack([axes[:, j] * axes[:, k] * (1.0 if j == k else 2.0) for j, k in PRODUCT_PAIRS])
+def power_coefficients(axes: np.ndarray, products: Sequence[tuple[int, ...]]) -> np.ndarray:
+    """
+    Return the coefficients of products of k components of v that give (u_i . v)^k for each row u_i of `axes`, shape (n_products, 3).
 
-
-def cube_coefficients(axes: np.ndarray) -> np.ndarray:
-    """Return the coefficients of `CUBES` that give (u_i . v)^3 for each row u_i of `axes`, shape (10, 3)."""
-    count = [1 if i == j == k else 6 if len({i, j, k}) == 3 else 3 for i, j, k in TRIPLES]
-    return np.stack([axes[:, i] * axes[:, j] * axes[:, k] * m for (i, j, k), m in zip(TRIPLES, count)])
+    The coefficient of ``v_a v_b ...`` is ``u_a u_b ...`` times the number of orders of its factors (multinomial theorem).
+    """
+    return np.stack([axes[:, list(product)].prod(axis=1) * len(set(permutations(product))) for product in products])
 
 
 def signed_coefficients(axes: np.ndarray) -> np.ndarray:

@@ -69,7 +69,7 @@ def _pair(sensor):
             plausible=('consumer', 4e-4 / STANDARD_GRAVITY if accel else 0.5 * DEG / (100 * DEG)**2, 'ADIS16460 data sheet: '
                         '0.1 % / 0.5 % of range'),
             motion=curved, groups=(own['SQUARES'],),
-            coefficients=partial(along_axis_coefficients, function=base.square_coefficients)),
+            coefficients=partial(along_axis_coefficients, function=partial(base.power_coefficients, products=base.PRODUCT_PAIRS))),
         Effect(
             name=f'{short}_scale_asymmetry', sensor=sensor, unit='1', against=(kind,),
             explanation=f'The {sensor} scale factor differs between positive and negative input.',
@@ -160,7 +160,7 @@ ACCELEROMETER = _pair('accelerometer') + (
         tolerance=MILLI_G / STANDARD_GRAVITY**3, tolerance_reason='1 mg at 1 g', prior_sd=100 * MILLI_G / STANDARD_GRAVITY**3,
         plausible=('consumer', 1e-4 / STANDARD_GRAVITY**2, 'field catalogue 6.1: some 10 ug/g^3'),
         motion=('centrifuge',), groups=(base.CUBES['accelerometer'],),
-        coefficients=partial(along_axis_coefficients, function=base.cube_coefficients)),
+        coefficients=partial(along_axis_coefficients, function=partial(base.power_coefficients, products=base.TRIPLES))),
     Effect(
         name='accel_cross_product', sensor='accelerometer', components=PRODUCTS, shape=(3, 3), unit='(m/s^2)^-1', against=('force',),
         explanation='The accelerometers are pendulums that give way: '

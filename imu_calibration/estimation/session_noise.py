@@ -94,8 +94,6 @@ def _at_rest(system, sensor, values):
     variance = np.full(3, 1e-30)
     for kind in system.within[sensor]:
         variance = np.maximum(variance, _misfit_of(system, sensor, kind, values).noise)
-    if not system.within[sensor]:
-        variance = np.full(3, system.means[sensor][:, -3:].var() + 1e-12)
     return NoiseModel(variance, np.ones(3), reference=reference)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.covariance_terms import Terms, of_fit, replace_weak, total
-from imu_calibration.estimation.model_error import ModelError
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.weighted_system import make_prior
 
@@ -106,9 +105,6 @@ class Solution:
     Sensor -> bias of each recording, shape (n_sessions, 3), for sensors whose bias differs between recordings; `values` has their mean.
     """
 
-    model_error: ModelError | None = None
-    """Allowances for misfit and drift in the covariance."""
-
     not_believed: dict[str, float] = field(default_factory=dict)
     """Fixed parameter -> its estimate, which exceeds the range of known sensors and is no larger than misfit can cause."""
 
@@ -195,8 +191,6 @@ def shrunk(solution: Solution, parts: list[slice]) -> Solution:
         Parameters of each effect.
 
     """
-    if solution.model_error is None:
-        return solution
     values, prior = solution.values.copy(), make_prior(solution.model).mean
     covariance = of_fit(solution.terms)
     for part in parts:

@@ -230,12 +230,11 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
             break
         not_believed |= {name: float(value) for name, value, flag in zip(model.param_names, values, strange) if flag}
         held |= strange
-    error = model_error(system, values, noises, free=free & ~held)
-    moving = system.bias_information(values, noises)
-    terms = {SAMPLE_NOISE: own - own @ moving @ own, BIAS_PROCESS: own @ moving @ own, HELD_PRIORS: of_held} | error.terms(own + of_held)
+    of_bias = own @ system.bias_information(values, noises) @ own
+    terms = {SAMPLE_NOISE: own - of_bias, BIAS_PROCESS: of_bias, HELD_PRIORS: of_held,
+             **model_error(system, values, noises, free=free & ~held).terms(own + of_held)}
     chi2, rms = _fit_quality(system, values, noises)
-    return Solution(model, values, terms, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises), error,
-                    not_believed)
+    return Solution(model, values, terms, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises), not_believed)
 
 
 def _with_noise(system, values, noises, free):

@@ -201,7 +201,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
             scatter = [solved(trial, poses, turns)[0].scatter.variance[SENSORS.index(effect.sensor)] for trial in trials]
             model = trials[int(np.argmin(scatter))]
     for _ in range(MAX_HAND_PASSES):
-        found, error, integrated = solved(model, poses, turns)
+        found, integrated = solved(model, poses, turns)
         integrated = {} if model.model.relinearised else integrated   # the columns below are computed at the estimate
         settled, model = _settled(model, found), model.at(found.state.values)
         poses, turns, out = without_outliers(model, found, poses=poses, turns=turns, integrated=integrated)
@@ -211,7 +211,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     movements = bias_movements(model, found.state.values, poses)
     if 'accelerometer' in movements:
         poses = without_movement(poses, movements)
-        found, error, _ = solved(model, poses, turns)
+        found, _ = solved(model, poses, turns)
     terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
     used, poses = poses, data.poses   # the result has all poses unchanged, also excluded and drifting ones
     goals = tolerances_of(model.model, options.tolerances)
@@ -224,7 +224,7 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     noise = {sensor: replace(poses.noise[sensor], offset_sd=statistics[f'{name}_scatter_sd'])
              for sensor, name in zip(SENSORS, COMPONENTS)}
     return HandCalibration(
-        model=model.model, values=found.state.values, terms=terms, held=found.held, noise=noise, residual_rms={}, model_error=error,
+        model=model.model, values=found.state.values, terms=terms, held=found.held, noise=noise, residual_rms={},
         chi2_per_dof={sensor: {'mean': None} for sensor in SENSORS}, information=found.factor.T @ found.factor, hand_model=model,
         tolerances=goals, statistics=statistics, poses=poses, state=found.state, used_poses=used, used_turns=turns)
 

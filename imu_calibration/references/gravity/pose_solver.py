@@ -19,9 +19,9 @@ from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.turns import missed_angle
 
 
-def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float) -> tuple[RowEstimate, ModelError, dict]:
+def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float) -> tuple[RowEstimate, dict]:
     """
-    Return the estimate of all parameters from poses and turns, the model error in its covariance, and the turns integrated there.
+    Return the estimate of all parameters from poses and turns, and the turns integrated there.
 
     Parameters
     ----------
@@ -35,10 +35,10 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
     """
     found = estimate_rows(GravityRows(model, poses, turns), first_state(model, poses), fallback=np.square(SCATTER_SD))
     reference, values = GravityRows(model, poses, turns), found.state.values
-    error = _model_error(reference, found)
-    terms = {**found.terms, **error.terms(total(found.terms)), GRAVITY: _of_gravity(model, values, gravity_sd / model.gravity),
+    terms = {**found.terms, **_model_error(reference, found).terms(total(found.terms)),
+             GRAVITY: _of_gravity(model, values, gravity_sd / model.gravity),
              UNMODELLED_EARTH_RATE: _of_earth(model, found.state, poses, found.free)}
-    return replace(found, terms=terms), error, reference.memory
+    return replace(found, terms=terms), reference.memory
 
 
 def _model_error(reference, found):
