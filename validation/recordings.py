@@ -5,7 +5,7 @@ from pathlib import Path
 
 import yaml
 
-from imu_calibration.calibration.hand_workflow import read_imu
+from imu_calibration.calibration.hand_workflow import read_by_hand
 from imu_calibration.core.samples import NominalScaling
 from imu_calibration.core.units import STANDARD_GRAVITY
 from msg_adapters.bag import open_recording
@@ -47,7 +47,7 @@ def gravity_of(folder, name):
 def load(folder, name, topic=None):
     """Return the cleaned ImuSamples of a recording, in SI."""
     with open_recording(folder / name, topic, want_joints=False) as recording:
-        imu = read_imu(recording.blocks())[0]
+        imu = read_by_hand(recording.blocks()).imu
     nominal = nominal_of(folder, name)
     return imu if nominal is None else nominal.apply(imu)
 

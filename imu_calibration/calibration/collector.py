@@ -16,10 +16,10 @@ from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.samples import NominalScaling, SampleBlock
 from imu_calibration.effects.base import SECTIONS, SENSORS
-from imu_calibration.effects.catalogue import Catalogue
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import columns
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import FACTORS, Accumulator, WindowBlock
+from imu_calibration.estimation.accumulator import CENTRED_FACTORS, Accumulator, WindowBlock
 from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics, joined_motion, reduce_window
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
@@ -89,16 +89,16 @@ def _header_of(accumulator):
 
 def _keys_of(part: Accumulator | WindowBlock):
     """Return the keys of the factors, in the order of `_factors_of`."""
-    return {name: [list(key) for key in getattr(part, name)] for name in FACTORS}
+    return {name: [list(key) for key in getattr(part, name)] for name in CENTRED_FACTORS}
 
 
 def _factors_of(part: Accumulator | WindowBlock, label):
-    return {f'{label}{name}.{k}': factor for name in FACTORS for k, factor in enumerate(getattr(part, name).values())}
+    return {f'{label}{name}.{k}': factor for name in CENTRED_FACTORS for k, factor in enumerate(getattr(part, name).values())}
 
 
 def _factors_in(header, arrays, label):
-    """Return the fields `FACTORS` of an Accumulator or WindowBlock."""
-    return {name: {tuple(key): arrays[f'{label}{name}.{k}'] for k, key in enumerate(header[name])} for name in FACTORS}
+    """Return the fields `CENTRED_FACTORS` of an Accumulator or WindowBlock."""
+    return {name: {tuple(key): arrays[f'{label}{name}.{k}'] for k, key in enumerate(header[name])} for name in CENTRED_FACTORS}
 
 
 def _arrays_of(accumulator, label):
@@ -162,7 +162,7 @@ def _model(header):
     point = {name: np.array(value, float) for name, value in header['point'].items()}
     effects, names = (tuple(header['model'][name]) for name in SECTIONS), header['model']['joint_names']
     return SensorModel(*effects, JointNames.of(names, header['model'].get('joint_errors')), header['temperature_ref_c'], point,
-                       catalogue=Catalogue.from_definitions(header.get('effects', {})))
+                       catalogue=CATALOGUE.with_definitions(header.get('effects', {})))
 
 
 def _check(header, model):

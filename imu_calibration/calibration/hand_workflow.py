@@ -135,12 +135,6 @@ def read_by_hand(blocks: Iterable[SampleBlock], nominal: NominalScaling | None =
     return HandRecording(imu, warm, {reason: count for reason, count in counts.items() if count})
 
 
-def read_imu(blocks: Iterable[SampleBlock], watchers: Sequence[Watcher] = ()) -> tuple[ImuSamples, dict[str, int]]:
-    """Return (ImuSamples, counts of dropped samples) of a recording, cleaned; raises as `read_by_hand`."""
-    recording = read_by_hand(blocks, watchers=watchers)
-    return recording.imu, recording.counts
-
-
 def calibrate_without_table(sources: Sequence[Callable], options: CalibrationOptions = CalibrationOptions(),
                             provenance: dict | None = None) -> HandResult:
     """

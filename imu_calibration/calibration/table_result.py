@@ -33,7 +33,7 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.weighted_system import fixed_parameters, make_prior
 from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.kinematics.chain import tilt
-from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.joint_motion import rest_at
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBlock
@@ -165,9 +165,8 @@ def _sources(result):
     """Yield (kind, time, session, count, stride, motion, temperature) of the windows at rest and of the moving ones that were kept."""
     rows = {(row.session, row.time): row.count for row in result.gathered.accumulator.rows if row.kind == 'static'}
     typical = float(np.median(list(rows.values()))) if rows else 1.0
-    zero = np.zeros((1, len(result.table.joints)))
     for time, session, position in result.gathered.poses:
-        motion = JointMotion(np.array([time]), np.asarray(position)[None], zero, zero, zero)
+        motion = replace(rest_at(np.asarray(position)[None]), time=np.array([time]))
         yield 'static', time, session, rows.get((session, time), typical), 1, motion, None
     stride = max(1, int(np.ceil(sum(len(w) for w in result.gathered.kept) / MOVING_SAMPLES)))
     for number, window in enumerate(result.gathered.kept):

@@ -21,7 +21,7 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Namespace) -> VerbResult:
     """Estimate and print."""
     from imu_calibration.between_imus.arm import estimate_arm
-    from imu_calibration.calibration.hand_workflow import read_imu
+    from imu_calibration.calibration.hand_workflow import read_by_hand
     from imu_calibration.cli.show import warn
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.core.units import with_sd
@@ -41,7 +41,7 @@ def run(options: Namespace) -> VerbResult:
         open_bag(options.bag, topic, want_joints=False).close()
         blocks = source_of(options.bag, topic)()
         preflight = Preflight()
-        imus.append(read_imu(blocks, [preflight])[0])
+        imus.append(read_by_hand(blocks, watchers=[preflight]).imu)
         warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(preflight.findings))
     first, second = imus
     result = estimate_arm(first, second)

@@ -211,7 +211,7 @@ def parts_of(document: Mapping) -> dict[str, Any]:
 def _model(document):
     """Return (SensorModel, {(sensor, effect): entry of the document})."""
     joint_names = JointNames.of(document.get('joint_names', JOINTS), document.get('joint_errors'))
-    catalogue = Catalogue.from_definitions(document.get('effects') or {})
+    catalogue = CATALOGUE.with_definitions(document.get('effects') or {})
     owners = {effect.name: effect.sensor for effect in catalogue.effects(joint_names).values() if effect.in_reference}
     members, entries = {section: [] for section in SECTIONS}, {}
     for section in SECTIONS:

@@ -212,11 +212,6 @@ class Catalogue:
                                  "make it with `effects.catalogue.term`", code='made_of_code')
         return {effect.name: effect.definition for effect in added}
 
-    @classmethod
-    def from_definitions(cls, definitions: dict[str, Any]) -> 'Catalogue':
-        """Return the catalogue with the effects of {name: plain data}."""
-        return cls().with_definitions(definitions)
-
     def with_definitions(self, definitions: dict[str, Any]) -> 'Catalogue':
         """
         Return a catalogue with the effects of {name: plain data} too.

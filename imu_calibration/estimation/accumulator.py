@@ -22,12 +22,12 @@ LEAST_ROWS = 16
 """Rows that an accumulator keeps however many share the memory: neighbours of the same kind must be among them."""
 
 
-FACTORS = ('within', 'slow')
+CENTRED_FACTORS = ('within', 'slow')
 """Fields with the triangular factors of the centred rows, and of their slow parts."""
 
 
 class _CentredRows:
-    """Addition of the centred rows of windows to the `FACTORS`."""
+    """Addition of the centred rows of windows to the `CENTRED_FACTORS`."""
 
     within: dict
     slow: dict
@@ -40,7 +40,7 @@ class _CentredRows:
                 stack(self.slow, (sensor, window.kind), statistics.slow)
 
     def _stack_all_of(self, other):
-        for name in FACTORS:
+        for name in CENTRED_FACTORS:
             for key, factor in getattr(other, name).items():
                 stack(getattr(self, name), key, factor)
 
@@ -234,8 +234,8 @@ def restrict(accumulator: Accumulator, wide: SensorModel, narrow: SensorModel) -
 
 
 def _chosen_factors(part, chosen):
-    """Return the `FACTORS` of an accumulator or block with the columns `chosen` only."""
-    return {name: {key: factor[:, chosen[key[0]]] for key, factor in getattr(part, name).items()} for name in FACTORS}
+    """Return the `CENTRED_FACTORS` of an accumulator or block with the columns `chosen` only."""
+    return {name: {key: factor[:, chosen[key[0]]] for key, factor in getattr(part, name).items()} for name in CENTRED_FACTORS}
 
 
 def restricted_window(window: WindowStatistics, chosen: dict[str, np.ndarray]) -> WindowStatistics:

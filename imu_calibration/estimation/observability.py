@@ -70,7 +70,7 @@ def _attitudes(up_s):
 MOTION_TIME = np.arange(0.0, 30.0, 0.02)
 DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)])
 """Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""
-FACES = [sign * row for row in np.eye(3) for sign in (1, -1)]
+FACES_UP = [sign * row for row in np.eye(3) for sign in (1, -1)]
 """The six faces turned up, in the sensor frame."""
 
 
@@ -104,7 +104,7 @@ def _shaken(gravity):
     """Rest in six faces, quiet and while the sensor is shaken along each axis."""
     one, shakes = np.zeros(1), (np.zeros(3), *VIBRATION_VARIANCE * np.eye(3))
     return [_turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, shaking=shaking)
-            for shaking in shakes for k, up in enumerate(FACES)]
+            for shaking in shakes for k, up in enumerate(FACES_UP)]
 
 
 def rest_with_up(up: np.ndarray) -> 'Motion':
@@ -160,9 +160,9 @@ MOTIONS = (
     Motion('centrifuge', 'spin at 300 deg/s on an arm of 0.3 m, about each axis', lambda g: [
         piece for k in range(3) for piece in _spin(np.eye(3)[k], (-300, 300), arm=0.3 * np.roll(np.eye(3)[k], 1))(g)]),
     Motion('warm_up', 'rest in six faces, cold and warm',
-           _poses(FACES, (15.0, 25.0, 35.0))),
+           _poses(FACES_UP, (15.0, 25.0, 35.0))),
     Motion('warm_and_cool', 'rest in six faces while it warms up by ten kelvins, and again while it cools',
-           _poses(FACES, (20.0, 25.0, 30.0, 25.0, 20.0))),
+           _poses(FACES_UP, (20.0, 25.0, 30.0, 25.0, 20.0))),
     Motion('shake', 'rest in six faces, quiet and while a machine shakes the sensor along each axis', _shaken),
 )
 """Standard motions of the sensor; motions of table joints are named by the effects that need them."""

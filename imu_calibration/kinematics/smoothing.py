@@ -138,8 +138,6 @@ class Smooth:
 
     coefficients: np.ndarray
     """Spline coefficients, shape (n_coefficients,)."""
-    penalty: float
-    """Penalty of the third differences that was chosen."""
     dof: float
     """Effective number of parameters."""
     bandwidth: float
@@ -250,7 +248,7 @@ def smooth(spline: PenalisedSpline, values: np.ndarray, noise_floor: Sequence[fl
         gain, _ = spline.gains(penalty)
         noise = np.sqrt(residual / (1 - gain))
         for place, column in enumerate(columns.tolist()):
-            results[column] = Smooth(coefficients[:, place], penalty, gain * spline.n_rows, spline.bandwidth(penalty),
+            results[column] = Smooth(coefficients[:, place], gain * spline.n_rows, spline.bandwidth(penalty),
                                      float(noise[place]))
     return [results[column] for column in range(len(decades))]
 

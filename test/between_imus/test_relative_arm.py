@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.between_imus.arm import RelativeArm, estimate_arm
 from imu_calibration.between_imus.pair import clipped, make_windows
-from imu_calibration.calibration.hand_workflow import read_imu
+from imu_calibration.calibration.hand_workflow import read_by_hand
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.kinematics.rotations import lever_matrix
@@ -175,7 +175,7 @@ def test_boards_of_several_imus(recordings):
     from msg_adapters.bag import open_recording
     arms, sds, errors = {}, {}, {}
     for name in ('array_2', 'array_5'):
-        imus = {k: read_imu(open_recording(recordings / name, f'/imu_{k}/data_raw', want_joints=False).blocks())[0] for k in BOARD_MM}
+        imus = {k: read_by_hand(open_recording(recordings / name, f'/imu_{k}/data_raw', want_joints=False).blocks()).imu for k in BOARD_MM}
         for a, b in PAIRS:
             found = estimate_arm(imus[a], imus[b])
             key = (name, a, b)

@@ -258,7 +258,7 @@ def test_a_column_is_arithmetic_and_nothing_else(column):
     ({'unit': None}, 'not_a_text', None), ({'colour': 'red'}, 'definition_keys', 'colour')])
 def test_a_definition_is_refused_in_one_line(changed, code, value):
     with refused(InputError, code, 'mine', value) as caught:
-        Catalogue.from_definitions({'mine': ADDED['gyro_anisoelasticity'] | changed})
+        CATALOGUE.with_definitions({'mine': ADDED['gyro_anisoelasticity'] | changed})
     assert '\n' not in str(caught.value)
 
 

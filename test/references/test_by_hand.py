@@ -373,9 +373,9 @@ def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_se
 # real recordings
 
 def load(recordings, name, topic=None):
-    from imu_calibration.calibration.hand_workflow import read_imu
+    from imu_calibration.calibration.hand_workflow import read_by_hand
     from msg_adapters.bag import open_recording
-    return read_imu(open_recording(recordings / name, topic, want_joints=False).blocks())[0]
+    return read_by_hand(open_recording(recordings / name, topic, want_joints=False).blocks()).imu
 
 
 def heldout_norm_rms(imu, ranges, gravity, **options):
