@@ -95,7 +95,7 @@ def gain_in_turn(problem: LinearisedProblem, before: Sequence[Question], after: 
 
 def gain_of(sensor: str, measure: str, pair: Sequence[tuple[np.ndarray, np.ndarray]], *, of: str = OF_MODEL) -> Gain:
     """Return the Gain from (sums of squares, numbers) of each group of rows, before and after."""
-    before, after = (_rms(*entry) for entry in pair)
+    before, after = (float(np.sqrt(squares.sum() / max(number.sum(), 1))) for squares, number in pair)
     return Gain(sensor, measure, before, after, reduction_interval(pair), len(pair[0][0]), of)
 
 
@@ -119,10 +119,6 @@ def _certainty(pair):
     """Return by how many standard deviations sums of squares fall from window to window."""
     fall = pair[0][0] - pair[1][0]
     return float(fall.sum() / max(np.sqrt(fall @ fall), 1e-300))
-
-
-def _rms(squares, number):
-    return float(np.sqrt(squares.sum() / max(number.sum(), 1)))
 
 
 def reduction_interval(pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:

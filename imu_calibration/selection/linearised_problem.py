@@ -102,10 +102,7 @@ class LinearisedProblem:
 
     def values(self, chosen: Sequence[Question]) -> np.ndarray:
         """Return all parameters of the space for a choice, fitted to the selection windows, with all of the baseline, shape (q,)."""
-        used = self.search.indices(chosen)
-        values = np.zeros(self.space.size)
-        values[list(used)] = self.evidence.fit(used)[0]
-        return self.absolute(values)
+        return self.absolute(self.search.values(chosen))
 
     def absolute(self, values: np.ndarray) -> np.ndarray:
         """Return parameters of the whole space in full, from those that count from the linearisation, shape (q,)."""

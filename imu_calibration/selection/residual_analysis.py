@@ -37,7 +37,6 @@ class ResidualAnalysis(Investigation):
     """The reference."""
     _fits: dict = field(default_factory=dict, init=False, repr=False)
     _formulas: dict = field(default_factory=dict, init=False, repr=False)
-    _proposals: dict = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of(cls, found: Investigation, table: Table) -> 'ResidualAnalysis':
@@ -78,17 +77,16 @@ class ResidualAnalysis(Investigation):
         """Return a formula for the residual of a sensor with the choice of some fits (`propose`)."""
         return propose(self.blocks[sensor], self.problem, fits, formulas=self.formulas(sensor))
 
-    def proposal(self, sensor: str) -> Proposal | None:
+    @cached_property
+    def proposals(self) -> dict[str, Proposal | None]:
         """
-        Return a formula for the residual of a sensor, where it is significant or clear within moving windows.
+        Sensor -> a formula for its residual, where it is significant or clear within moving windows.
 
         Variation within moving windows is modelled as noise; a formula that explains it shows that it is deterministic.
         """
-        if sensor not in self._proposals:
-            fits = self.fits(sensor)
-            clear = self.rests[sensor].significant or fits.sigma > MIN_FORMULA_SDS
-            self._proposals[sensor] = self.proposed(sensor, fits) if clear else None
-        return self._proposals[sensor]
+        fits = {sensor: self.fits(sensor) for sensor in self.rests}
+        return {sensor: self.proposed(sensor, fits[sensor]) if rest.significant or fits[sensor].sigma > MIN_FORMULA_SDS else None
+                for sensor, rest in self.rests.items()}
 
     def columns(self, sensor: str, proposal: Proposal | None) -> np.ndarray | None:
         """Return the columns of the formulas of a proposal over the blocks of a sensor, shape (b, k, 3), or None without one."""
@@ -104,7 +102,7 @@ class ResidualAnalysis(Investigation):
     def unexplained(self) -> dict[str, Unexplained]:
         """Sensor -> the unexplained excess with its tones, and with regimes and a proposal where it is significant."""
         report('analysing the residual')
-        tones = find_tones(self, self.table, [proposal for sensor in self.rests if (proposal := self.proposal(sensor)) is not None])
+        tones = find_tones(self, self.table, [proposal for proposal in self.proposals.values() if proposal is not None])
         return {sensor: self._unexplained(sensor, replace(rest, tones=tones[sensor])) for sensor, rest in self.rests.items()}
 
     @cached_property
@@ -113,7 +111,7 @@ class ResidualAnalysis(Investigation):
         return next(iter(self.blocks.values())).jitter
 
     def _unexplained(self, sensor, rest):
-        proposal = self.proposal(sensor)
+        proposal = self.proposals[sensor]
         regimes = self.regimes(sensor, formula=self.columns(sensor, proposal))
         first = {regime.axis: regime for regime in reversed(regimes)}
         if not rest.significant and proposal is None and not first:
@@ -185,13 +183,13 @@ def _done_without(found, question):
     """Return whether a finding hardly reduces the residual of its sensors with a substitute in some of them."""
     sensors = sensors_of(question.effect)
     warm = 'temperature' in question.effect.needs
-    asked = [sensor for sensor in sensors if warm or found.rests[sensor].significant or found.proposal(sensor)]
+    asked = [sensor for sensor in sensors if warm or found.rests[sensor].significant or found.proposals[sensor]]
     if not asked:
         return False
     others = [other for other in found.named if other is not question]
     kept, left_out = ({sensor: found.fits(sensor, some) for sensor in sensors} for some in (found.named, others))
     alone = {sensor: left_out[sensor].fit().excess - kept[sensor].fit().excess for sensor in sensors}
-    for stand_in in (lambda sensor: found.columns(sensor, found.proposal(sensor)),
+    for stand_in in (lambda sensor: found.columns(sensor, found.proposals[sensor]),
                      lambda sensor: found.columns(sensor, found.proposed(sensor, left_out[sensor])),
                      lambda sensor: _places(found, sensor, others)):
         beside = dict(alone)

@@ -84,7 +84,6 @@ class Search:
                  any_size: bool = False, resolved: AbstractSet[str] = frozenset()):
         self.evidence, self.baseline, self.questions = evidence, tuple(baseline), questions
         self.encoder_step, self.any_size, self.resolved = encoder_step, any_size, resolved
-        self.history = []
 
     def asking_any_size(self) -> 'Search':
         """Return a search that allows sizes that are known of no instrument too."""
@@ -139,6 +138,12 @@ class Search:
         value, sd = self.estimate(chosen, question)
         return question.effect.surpasses(value[:amplitudes], sd[:amplitudes])
 
+    def values(self, chosen: Sequence[Question]) -> np.ndarray:
+        """Return all parameters for a choice, fitted to all rows; zero for those of other effects, shape (q,)."""
+        used, values = self.indices(chosen), np.zeros(len(self.evidence.total) - 1)
+        values[list(used)] = self.evidence.fit(used)[0]
+        return values
+
     def estimate(self, chosen: Sequence[Question], question: Question) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, standard deviations) of the parameters of a chosen effect."""
         used = self.indices(chosen)
@@ -171,7 +176,6 @@ class Search:
         for _ in range(2 * MOST_FINDINGS):
             others = self.others(chosen)
             scores = [self.score(chosen, q) for q in reported('testing effects', others, len(others))]
-            self.history.append(scores)
             good = [s for s in scores if s.significant]
             if not good or len(chosen) >= MOST_FINDINGS:
                 break

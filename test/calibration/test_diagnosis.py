@@ -10,7 +10,6 @@ from refusal import refused
 from scipy.stats import chi2
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
-from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
 from imu_calibration.compensation.compensate import compensate
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.document.calibration import Calibration
@@ -20,6 +19,7 @@ from imu_calibration.selection.gain import APPLIED, OF_MODEL, heldout_gain
 from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.residual_analysis import inquire
 
+from worlds.diagnosing import diagnose
 from worlds.hiding import Sizes, record
 
 SEED, QUICK = 3, {'profile': 'quick', 'imu_rate': 50.0, 'joint_rate': 50.0}
@@ -47,7 +47,7 @@ def seek(effect, sizes):
 def test_nothing_is_found_where_nothing_is_hidden(sizes):
     search = sizes.problem.search
     assert search.run() == []
-    assert [s.question.label for s in search.history[0] if s.significant] == []
+    assert not any(search.score([], question).significant for question in search.questions)
 
 
 @pytest.mark.parametrize('effect', ['accel_quadratic', 'gyro_saturation', 'encoder_harmonic', *(
@@ -118,7 +118,8 @@ def test_what_locked_windows_show_moves_the_gain_and_nothing_else(sizes):
     windows = [replace(w, force_s=w.force_s + 10 * w.noise_sd[0], rate_s=w.rate_s + 10 * w.noise_sd[1]) if w in struck else w for w in used]
     found, other = (investigate(some, recording.table, recording.model) for some in (used, windows))
     assert [q.label for q in found.named] == [q.label for q in other.named] == ['accel_quadratic']
-    assert [[s.gain for s in scores] for scores in found.problem.search.history] == [[s.gain for s in scores] for scores in other.problem.search.history]
+    one, two = ([search.score([], question).gain for question in search.questions] for search in (found.problem.search, other.problem.search))
+    assert one == two
     for one, two in zip(found.problem.evidence.fit(found.problem.search.indices(found.named)), other.problem.evidence.fit(other.problem.search.indices(other.named))):
         np.testing.assert_array_equal(one, two)
     for sensor, noise in found.problem.noise.items():

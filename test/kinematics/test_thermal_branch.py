@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
 from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
@@ -14,6 +13,7 @@ from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.selection.questions import testable_effects as asked_of
 
 from worlds.compensation_cases import random_calibration
+from worlds.diagnosing import diagnose
 from worlds.hiding import record
 from worlds.physics import make_session
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
 from imu_calibration.compensation.sample_compensation import SampleCompensation
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -19,6 +18,7 @@ from imu_calibration.simulation.sensor_noise import SimulatedNoise
 from imu_calibration.simulation.session import SimulationOptions, answered, simulate
 
 from worlds.compensation_cases import random_calibration
+from worlds.diagnosing import diagnose
 from worlds.hiding import record
 from worlds.physics import TABLES, make_session
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis, diagnose
+from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
 from imu_calibration.cli.main import main
 from imu_calibration.document import files
 from imu_calibration.effects.expressions import ColumnGroup
@@ -23,6 +23,7 @@ from imu_calibration.selection.residual_fit import BlockFits, share_interval, sh
 
 from worlds import physics
 from worlds.beyond_catalogue import row_of
+from worlds.diagnosing import diagnose
 from worlds.hiding import record
 from worlds.physics_beyond import Beyond
 
@@ -109,7 +110,7 @@ def test_blocks_of_a_recording_that_hides_nothing_are_noise():
 @pytest.mark.parametrize('kind, text', [('scale_under_load', 'f_'), ('gyro_cubic', '** 3'), pytest.param('stray_field_accel', 'sin(', marks=pytest.mark.long)])
 def test_a_formula_is_found_and_judged_on_windows_that_took_no_part(kind, text):
     found, blocks, cause = looked(kind)
-    proposal = found.proposal(cause.kind.sensor)
+    proposal = found.proposals[cause.kind.sensor]
     assert text in proposal.columns[0] and proposal.family == cause.kind.family and set(proposal.axes) == cause.axes
     assert proposal.share > 0.95 and proposal.ci95[0] > 0.9 and proposal.reduction > 0.8
     assert proposal.nearest[0] in proposal.sentence
@@ -163,7 +164,7 @@ def test_the_place_is_found(kind, size):
 def test_the_formula_is_printed():
     (recording, cause), (found, _, _) = recorded('scale_under_load'), looked('scale_under_load')
     lines = '\n'.join(diagnosis_lines(build_diagnosis(recording.table, without_superseded(found))))
-    assert all(part in lines for part in ('f_z * w', f'axis {min(cause.axes)}', found.proposal('gyroscope').sentence))
+    assert all(part in lines for part in ('f_z * w', f'axis {min(cause.axes)}', found.proposals['gyroscope'].sentence))
 
 
 def test_a_mount_that_bends_is_named_in_both_sensors():

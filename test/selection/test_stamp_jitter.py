@@ -8,12 +8,12 @@ import pytest
 import imu_calibration as imu
 from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import timing_lines
-from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
 from imu_calibration.document.decision import WARNING
 from imu_calibration.document.verdict import NOTED_MISFIT, misfit_ratios, misfits
 from imu_calibration.kinematics.table import Table
 from imu_calibration.selection.stamp_jitter import jitter_ratio, stamp_jitter
 
+from worlds.diagnosing import diagnose
 from worlds.hiding import record
 from worlds.physics import make_session
 

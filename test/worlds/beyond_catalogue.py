@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import extended_solution
-from imu_calibration.calibration.diagnosis.table_diagnosis import diagnose
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.unexplained import biases_off
 
+from worlds.diagnosing import diagnose
 from worlds.hiding import record
 from worlds.physics_beyond import Beyond
 

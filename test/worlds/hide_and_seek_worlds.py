@@ -5,12 +5,13 @@ from itertools import combinations
 
 import numpy as np
 
-from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis, diagnose
+from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
 from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import heldout_gain
 from imu_calibration.selection.investigation import investigate
 
 from worlds.beyond_catalogue import NOTHING, hidden_row, row_of
+from worlds.diagnosing import diagnose
 from worlds.hiding import NOT_SIZED, all_effects, options_of, record, sizes_for
 from worlds.physics_beyond import KINDS
 from worlds.physics_draw import OUTSIDE, generator

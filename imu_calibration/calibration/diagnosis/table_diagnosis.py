@@ -1,7 +1,5 @@
-"""From windows to findings: the function that tests every effect and describes the findings."""
+"""From the result of a search to findings: the function that describes them."""
 
-from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -9,53 +7,18 @@ from imu_calibration.calibration.by_evidence import extended_solution
 from imu_calibration.calibration.diagnosis.applied_gain import gain_of_findings
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, parameters_of
 from imu_calibration.calibration.diagnosis.sentences import candidates_of, finding, motions_of_one_joint, sentence, separating_motion
-from imu_calibration.calibration.diagnosis.traces import residual_traces
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import Gain, gain_in_turn
 from imu_calibration.selection.investigation import Investigation
-from imu_calibration.selection.residual_analysis import ResidualAnalysis, inquire
+from imu_calibration.selection.residual_analysis import ResidualAnalysis
 
 MATE = 0.5
 """Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's reduction."""
 HALF = 0.5
 """Share of a finding that an unnamed effect would replace, from which it is reported with the finding."""
-
-
-def diagnose(windows: Sequence[Window], table: Table, model: SensorModel, *, bias_processes: dict | None = None) -> Diagnosis:
-    """
-    Diagnose the errors of a model and their causes.
-
-    The recording is reduced once to sufficient statistics of every effect's columns per window; the search then tests each effect
-    that is not in the model on held-out windows.
-
-    Parameters
-    ----------
-    windows : sequence of Window
-        One recording in order; windows of kind 'unused' are not fitted, but are used by dead reckoning.
-    table : Table
-        The reference.
-    model : SensorModel
-        The model to diagnose.
-    bias_processes : dict, optional
-        Sensor -> its bias processes, where measured separately.
-
-    Returns
-    -------
-    Diagnosis
-
-    Raises
-    ------
-    NotObservableError
-        When there are too few windows to hold any out.
-
-    """
-    result = build_diagnosis(table, inquire(windows, table, model, bias_processes=bias_processes))
-    return replace(result, traces=residual_traces(windows, table, result.baseline, after=result.solution))
 
 
 def build_diagnosis(table: Table, found: Investigation, *, calibrated: Solution | None = None) -> Diagnosis:

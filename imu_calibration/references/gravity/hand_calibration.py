@@ -231,13 +231,8 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
 
 def _settled(model, found):
     """Return whether the columns of warm-ups were computed close enough to the solution."""
-    for effect in model.extras:
-        part = model.model.slices[effect.key]
-        if effect.time_constant and not found.held[part][-1]:
-            known = model.model.point_of(effect)[-1]
-            if abs(found.state.values[part][-1] / known - 1) > MAX_SETTLED_CHANGE:
-                return False
-    return True
+    known = [(model.model.slices[e.key].stop - 1, model.model.point_of(e)[-1]) for e in model.extras if e.time_constant]
+    return all(found.held[k] or abs(found.state.values[k] / time - 1) <= MAX_SETTLED_CHANGE for k, time in known)
 
 
 def default_gyroscope(poses: Poses) -> tuple[tuple[str, ...], dict]:

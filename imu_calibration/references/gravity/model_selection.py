@@ -51,12 +51,6 @@ class HandProblem:
         blocks = [block.select(~np.isin(block.pose, poses)) for block in self.blocks]
         return [block for block in blocks if block.known.size > 3]
 
-    def values(self, chosen: Sequence[Question]) -> np.ndarray:
-        """Return the parameters of `HandSpace` with some effects, zero for all others, shape (q,)."""
-        used, values = list(self.search.indices(chosen)), np.zeros(self.space.size)
-        values[used] = self.evidence.fit(used)[0]
-        return values
-
     def named(self) -> list[Question]:
         """
         Return the findings: chosen effects of which each explains most of the excess variance.
@@ -96,7 +90,7 @@ class HandProblem:
             rows = np.isin(block.pose, out)
             for residual, choice in zip(pair, (before, after)):
                 allowed = {question.name for question in choice}
-                values = smaller.values([question for question in named if question.name in allowed])
+                values = smaller.search.values([question for question in named if question.name in allowed])
                 residual[rows] = block.rows[rows, :, -1] - block.rows[rows, :, :-1] @ values
         return gain_of_poses(block, pair)
 
@@ -141,7 +135,7 @@ class HandInvestigation(SelectedEffects):
 
     def point(self, problem: HandProblem, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
         """Return effect -> initial values for its columns, of the warm-ups among the chosen effects, from the rows of `problem`."""
-        fit, warm = problem.values(chosen), [question for question in chosen if '@' in question.label]
+        fit, warm = problem.search.values(chosen), [question for question in chosen if '@' in question.label]
         return {q.name: np.append(fit[list(q.parameters)], self.constants[int(q.label.split('@')[1])]) for q in warm}
 
     def extended(self, problem: HandProblem, chosen: Sequence[Question]) -> tuple[HandModel, np.ndarray, float]:
@@ -150,7 +144,7 @@ class HandInvestigation(SelectedEffects):
 
         `problem` has the rows for the estimate, those of this investigation or fewer.
         """
-        hand, point, fit = self.baseline, self.point(problem, chosen), problem.values(chosen)
+        hand, point, fit = self.baseline, self.point(problem, chosen), problem.search.values(chosen)
         base = hand.model
         names = {sensor: getattr(base, sensor) + tuple(q.name for q in chosen if q.sensor == sensor) for sensor in SENSORS}
         model = replace(hand.hand_model, model=replace(base, **names, point={**base.point, **point}))

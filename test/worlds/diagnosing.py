@@ -1,0 +1,13 @@
+"""The diagnosis of windows on a table, with its traces."""
+
+from dataclasses import replace
+
+from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
+from imu_calibration.calibration.diagnosis.traces import residual_traces
+from imu_calibration.selection.residual_analysis import inquire
+
+
+def diagnose(windows, table, model, *, bias_processes=None):
+    """Return the Diagnosis of the errors of a model on the windows of one recording, in order; unused ones serve dead reckoning."""
+    found = build_diagnosis(table, inquire(windows, table, model, bias_processes=bias_processes))
+    return replace(found, traces=residual_traces(windows, table, found.baseline, after=found.solution))
