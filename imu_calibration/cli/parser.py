@@ -6,10 +6,10 @@ from argparse import Namespace
 from collections.abc import Mapping
 from importlib import import_module
 from shutil import get_terminal_size
-from textwrap import wrap
 from typing import Any, NamedTuple, NoReturn, TextIO
 
 import imu_calibration
+from imu_calibration.cli.terminal import wrapped
 from imu_calibration.core.errors import ERROR_KEYS, did_you_mean
 
 VERBS = {
@@ -84,8 +84,7 @@ def folded(text: str, indent: str = '', last: str = '', *, stream: TextIO | None
     """Return a line for `stream` (standard output), broken between words at the width of a terminal; `last` ends each but the last part."""
     if not (stream or sys.stdout).isatty():
         return text
-    width = get_terminal_size().columns - len(last)
-    return f'{last}\n'.join(wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False))
+    return f'{last}\n'.join(wrapped(text, get_terminal_size().columns - len(last), indent))
 
 
 def make_parser(verb: str | None = None) -> OneLineParser:

@@ -45,7 +45,7 @@ class Terminal:
 
     def print(self, text: str = '', style: str = '') -> None:
         """Print the lines of a text."""
-        self.write(self.styled(part, style) for line in text.splitlines() or [''] for part in _wrapped(line, self.width))
+        self.write(self.styled(part, style) for line in text.splitlines() or [''] for part in wrapped(line, self.width))
 
     def write(self, lines: Iterable[str]) -> None:
         """Print lines as they are."""
@@ -85,7 +85,7 @@ class Terminal:
             widths = [*widths[:-1], min(widths[-1], room)]
         lines = []
         for row in cells:
-            for parts in zip_longest(*(_wrapped(text, width) for (text, _), width in zip(row, widths, strict=True)), fillvalue=''):
+            for parts in zip_longest(*(wrapped(text, width) for (text, _), width in zip(row, widths, strict=True)), fillvalue=''):
                 padded = [part.rjust(width) if k in right else part.ljust(width) for k, (part, width) in enumerate(zip(parts, widths))]
                 last = len(padded) - 1
                 padded[last] = padded[last].rstrip()
@@ -93,9 +93,9 @@ class Terminal:
         return lines
 
 
-def _wrapped(text, width):
-    """Return the lines of one line of text, broken between words; further lines have its indentation."""
+def wrapped(text: str, width: int, indent: str | None = None) -> list[str]:
+    """Return the lines of one line of text, broken between words; further lines begin with `indent`, by default its indentation."""
     if len(text) <= width:
         return [text]
-    indent = ' ' * (len(text) - len(text.lstrip()))
+    indent = ' ' * (len(text) - len(text.lstrip())) if indent is None else indent
     return textwrap.wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)

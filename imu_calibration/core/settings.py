@@ -1,7 +1,7 @@
 """Every adjustable number, declared once: YAML files, options and ROS parameters are made from here."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from typing import Any
 
 from imu_calibration.core.errors import InputError
@@ -9,40 +9,39 @@ from imu_calibration.core.errors import InputError
 
 @dataclass(frozen=True)
 class Setting:
-    """One field of a settings dataclass, as it was declared."""
+    """One field of a settings dataclass, as it is declared."""
 
-    name: str
-    """Name of the field, the option and the parameter."""
     default: Any
     """Its type is the setting's."""
     unit: str
     """'' or '1' without one."""
     text: str
     """Meaning."""
-    bounds: tuple
+    bounds: tuple = (None, None)
     """(smallest, largest) value; None: no end."""
-    symptom: str
+    symptom: str = ''
     """Symptoms of a wrong value."""
-    live: bool
+    _: KW_ONLY
+    live: bool = False
     """Whether a change applies to a running session."""
-    fixed: str
+    fixed: str = 'it is read at the start'
     """Why not, when it does not."""
-    session: bool
+    session: bool = False
     """Whether it names an input of a session: settings files omit it, because they would override earlier options."""
-    path: bool
+    path: bool = False
     """Whether it is the path of a file; such a ROS parameter is read-only, because any participant can set writable ones."""
+    name: str = ''
+    """Name of the field, the option and the parameter."""
 
 
-def setting(default: Any, unit: str, text: str, bounds: tuple = (None, None), symptom: str = '', *, live: bool = False,
-            fixed: str = 'it is read at the start', session: bool = False, path: bool = False) -> Any:
+def setting(default: Any, *declared: Any, **options: Any) -> Any:
     """Declare one field of a settings dataclass; arguments as in `Setting`."""
-    return field(default=default, metadata={'unit': unit, 'text': text, 'bounds': bounds, 'symptom': symptom, 'live': live, 'fixed': fixed,
-                                            'session': session, 'path': path})
+    return field(default=default, metadata={'setting': Setting(default, *declared, **options)})
 
 
 def describe(group: Any) -> list[Setting]:
     """Return the Setting of each field of a settings class or instance."""
-    return [Setting(f.name, f.default, **f.metadata) for f in fields(group)]
+    return [replace(f.metadata['setting'], name=f.name) for f in fields(group)]
 
 
 def override(group: Any, values: Mapping[str, Any]) -> Any:
@@ -55,7 +54,7 @@ def override(group: Any, values: Mapping[str, Any]) -> Any:
         When a name is unknown, a type does not fit or a value is out of bounds.
 
     """
-    known = {f.name: f for f in fields(group)}
+    known = {item.name: item for item in describe(group)}
     checked = {}
     for name, value in values.items():
         if name not in known:
@@ -65,7 +64,7 @@ def override(group: Any, values: Mapping[str, Any]) -> Any:
 
 
 def _checked(declared, value):
-    default, (low, high) = declared.default, declared.metadata['bounds']
+    default, (low, high) = declared.default, declared.bounds
     if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if default is not None and not isinstance(value, type(default)):

@@ -71,6 +71,11 @@ class Coordinates:
         return {sensor: np.einsum('cap,pq->caq', coefficient_jacobian(self.folded, sensor, self.values) * self.units, self.basis)
                 for sensor in SENSORS}
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the requested parameters."""
+        return np.array(self.model.param_names)[self.wanted].tolist()
+
     def sd(self, covariance: np.ndarray) -> np.ndarray:
         """Return standard deviations of all parameters, SI, from the covariance of z."""
         return self.units * np.sqrt(np.clip(np.einsum('pi,ij,pj->p', self.basis, covariance, self.basis), 0, None))
@@ -130,8 +135,8 @@ class WithinTolerances:
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
         """Return the parameters outside their tolerance."""
-        names = np.array(self.coordinates.model.param_names)[self.coordinates.wanted]
-        return tuple(names[self.coordinates.excess(covariance) > 1.0 + 1e-6].tolist())
+        excess = self.coordinates.excess(covariance)
+        return tuple(name for name, ratio in zip(self.coordinates.names, excess, strict=True) if ratio > 1.0 + 1e-6)
 
 
 @dataclass(frozen=True, eq=False)

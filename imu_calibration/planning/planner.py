@@ -217,8 +217,7 @@ class Planner:
     def excess(self) -> dict[str, float]:
         """Standard deviation over tolerance of each requested parameter, estimated or predicted."""
         coordinates = self.problem.coordinates
-        names = np.array(coordinates.model.param_names)[coordinates.wanted]
-        return dict(zip(names.tolist(), coordinates.excess(self._posterior.known).tolist(), strict=True))
+        return dict(zip(coordinates.names, coordinates.excess(self._posterior.known).tolist(), strict=True))
 
     def next_motion(self, position: np.ndarray) -> NextMotion:
         """Return the motion with the largest gain per second from where the joints are, and count on it."""

@@ -4,6 +4,7 @@ import io
 import math
 import re
 from collections.abc import Callable
+from functools import cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -77,23 +78,12 @@ class Drawn(str):
                  'lines': [(line.get_label(), *line.get_data()) for line in axes.get_lines()]} for axes in self.axes]
 
 
-INK, GREY, FAINT, GRID_GREY = '#1b2430', '#5c6877', '#98a2b0', '#e3e8ee'
+INK, GREY, FAINT = '#1b2430', '#5c6877', '#98a2b0'
 BEFORE, AFTER = '#d55e00', '#0072b2'
 AXIS_COLOURS = {'x': '#d55e00', 'y': '#009e73', 'z': '#0072b2'}
 """Colours of the three axes: vermilion, bluish green and blue of Okabe and Ito, distinct for colour-blind readers."""
 STATUS = {'determined': '#2b8a57', 'weak': '#d08a12', 'held': '#b4322c'}
 MARKER = {'x': 'o', 'y': 's', 'z': '^'}
-STYLE: Any = {
-    'font.family': 'sans-serif', 'font.sans-serif': ['DejaVu Sans'], 'font.size': 9.5, 'axes.titlesize': 10, 'axes.titleweight': 'bold',
-    'axes.titlelocation': 'left', 'axes.labelsize': 9.5, 'axes.labelcolor': GREY, 'axes.edgecolor': FAINT, 'axes.linewidth': 0.8,
-    'axes.spines.top': False, 'axes.spines.right': False, 'axes.grid': True, 'axes.axisbelow': True, 'grid.color': GRID_GREY,
-    'grid.linewidth': 0.8, 'xtick.color': FAINT, 'ytick.color': FAINT, 'xtick.labelcolor': GREY, 'ytick.labelcolor': GREY,
-    'xtick.labelsize': 8.5, 'ytick.labelsize': 8.5, 'text.color': INK, 'legend.frameon': False, 'legend.fontsize': 8.5,
-    'legend.handlelength': 1.4, 'figure.facecolor': 'none', 'axes.facecolor': 'none', 'savefig.facecolor': 'none', 'lines.linewidth': 1.5,
-    'axes.unicode_minus': True, 'axes.formatter.useoffset': False, 'svg.fonttype': 'none', 'path.simplify': True,
-    'text.parse_math': False,
-}
-
 NAMESPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
 
 
@@ -120,13 +110,20 @@ def draw(name: str, size: tuple[float, float], paint: Callable[..., None], *data
     from matplotlib.figure import Figure
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update({**STYLE, 'svg.hashsalt': name})
+        matplotlib.rcParams.update(_style() | {'svg.hashsalt': name})
         figure = Figure(figsize=size, layout='constrained')
         paint(figure, *data)
         canvas, text = _laid_out(figure), io.StringIO()
         figure.dpi = matplotlib.rcParams['figure.dpi']   # of pictures inside, which the canvas lays out at 72
         canvas.print_svg(text, metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None})
         return Drawn(_inside(text.getvalue(), str(escape(label))), figure)
+
+
+@cache
+def _style():
+    """Return the settings of matplotlib for figures of a page."""
+    from matplotlib import rc_params_from_file
+    return dict(rc_params_from_file(Path(__file__).with_name('templates') / 'figure.mplstyle', use_default_template=False))
 
 
 def _laid_out(figure):
