@@ -18,7 +18,7 @@ from imu_calibration.kinematics.motion_limits import MotionLimits
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.coordinates import Cause, Coordinates, ToldApart
 from imu_calibration.planning.motion_library import MotionLibrary
-from imu_calibration.planning.planner import Planner
+from imu_calibration.planning.planner import Decision, Planner
 from imu_calibration.planning.planning_problem import PlanningProblem
 from imu_calibration.planning.posterior import exact_information
 from imu_calibration.references.options import CalibrationOptions
@@ -157,18 +157,6 @@ class Suspect:
     """Parameter -> value, SI, of the effect and of each mate in its place."""
 
 
-@dataclass(frozen=True)
-class Decision:
-    """The next step: exactly one of a motion, a diagnosis and the end."""
-
-    motion: Any = None
-    """PlannedMotion to be driven."""
-    diagnose: bool = False
-    """Whether to diagnose."""
-    why: str = ''
-    """One line."""
-
-
 class Campaign:
     """
     A sequence of motions, each chosen after the one before.
@@ -247,10 +235,10 @@ class Campaign:
         """
         first, self._first = self._first, None
         if first is not None and (motion := first(position)) is not None:
-            return Decision(motion, why='the first motion is small and slow')
+            return Decision(motion, 'the first motion is small and slow')
         decision = self._decide(position, elapsed)
         if decision.motion is None and not decision.diagnose and (motion := self._unwind(position)) is not None:
-            return Decision(motion, why=f'{decision.why}; before the end, endless joints are unwound')
+            return Decision(motion, f'{decision.why}; before the end, endless joints are unwound')
         return decision
 
     def _decide(self, position, elapsed):
@@ -268,8 +256,8 @@ class Campaign:
             return Decision(why=f'{TIME_OVER}: the next motion takes {step.seconds:.0f} s{self._outside()}')
         if step.motion is not None:
             self._is_asked = False
-            return Decision(step.motion, why=step.reason)
-        return self._ending(step.reason)
+            return step
+        return self._ending(step.why)
 
     def _ending(self, reason):
         if self.settings.separations and not self._is_asked:

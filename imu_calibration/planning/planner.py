@@ -123,15 +123,17 @@ MAX_BOUND_RATIO, MIN_RELATIVE_WEIGHT = 1.1, 0.03
 
 
 @dataclass(frozen=True, eq=False)
-class NextMotion:
-    """The next step."""
+class Decision:
+    """The next step: exactly one of a motion, a diagnosis and the end."""
 
-    motion: PlannedMotion | None
-    """None at the end of the plan."""
-    reason: str
-    """Reason of the choice or of the end."""
+    motion: PlannedMotion | None = None
+    """Motion to be driven."""
+    why: str = ''
+    """Reason of the choice or of the end, one line."""
     seconds: float = 0.0
-    """Length with the way to it, s."""
+    """Length of the motion with the way to it, s."""
+    diagnose: bool = False
+    """Whether to diagnose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,22 +221,22 @@ class Planner:
         coordinates = self.problem.coordinates
         return dict(zip(coordinates.names, coordinates.excess(self._posterior.known).tolist(), strict=True))
 
-    def next_motion(self, position: np.ndarray) -> NextMotion:
+    def next_motion(self, position: np.ndarray) -> Decision:
         """Return the motion with the largest gain per second from where the joints are, and count on it."""
         missing = self.problem.goal.missing(self._posterior.known)
         place = self.problem.place_near(position)
         if self._first is None:
             self._first = [] if self.problem.known is not None else self.problem.first_rests(place)
         if not self._first and not self.problem.goal.left(self._posterior.known[None])[0] > 0:
-            return NextMotion(None, STUCK if missing else GOAL_REACHED)
+            return Decision(why=STUCK if missing else GOAL_REACHED)
         choice, must = CandidateMotions(self.problem, self._posterior, place), bool(self._first)
         number = self._first.pop(0) if must else choice.best
         if not must and self._visited and choice.hopeless(number):
-            return NextMotion(None, STUCK)
+            return Decision(why=STUCK)
         self._posterior.take(choice.information[number], float(choice.seconds[number]))
         motion = self._named(number)
         reason = 'a session begins with rests in many attitudes' if must else f'it gains most per second for {", ".join(missing[:3])}'
-        return NextMotion(motion, reason, motion.seconds_from(position))
+        return Decision(motion, reason, motion.seconds_from(position))
 
     def probe(self, position: np.ndarray, reach: np.ndarray) -> PlannedMotion | None:
         """Return a motion of every joint by at most `reach` (rad or m, shape (n_joints,)) to the wider side and back; None for zero."""

@@ -12,7 +12,7 @@ from imu_calibration.kinematics.motion_limits import limit_words, limits_of, mis
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import table_from_urdf
 from imu_calibration.planning.campaign import Campaign, CampaignSettings
-from imu_calibration.planning.planner import NextMotion, make_planner
+from imu_calibration.planning.planner import Decision, make_planner
 from imu_calibration.planning.planning_problem import noise_of_grade
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.table_controller import excess, trajectory_from
@@ -88,7 +88,7 @@ def test_an_endless_joint_keeps_to_its_turns_and_is_unwound_at_the_end(start):
             reached.append(points.position[:, 0])
             at = points.position[-1]
     assert np.ptp(np.concatenate(reached)) > 2 * np.pi and np.abs(np.concatenate(reached) - start).max() <= 2 * np.pi
-    planner.next_motion = lambda position: NextMotion(None, 'done')
+    planner.next_motion = lambda position: Decision(why='done')
     campaign = Campaign(planner, CampaignSettings(separations=0), unwind=planner.unwinding)
     wound = np.array([start + 6.0, 0.3])
     decision = campaign.decide(wound, 0.0)

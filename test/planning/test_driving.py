@@ -1,7 +1,6 @@
 """The driver: nothing moves before start, limits are kept, and whatever the joints do otherwise than asked stops everything with one sentence."""
 
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +26,7 @@ from imu_calibration.planning.campaign import (
 )
 from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
 from imu_calibration.planning.path_watch import PathWatch
+from imu_calibration.planning.planner import Decision
 from imu_calibration.planning.planning_problem import noise_of_grade
 from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
@@ -358,7 +358,7 @@ class OldHand:
     def next_motion(self, position):
         self.motions -= 1
         moves = self.motions >= 0
-        return SimpleNamespace(motion='a motion' if moves else None, seconds=10.0, reason='it helps' if moves else 'all within tolerance', missing=())
+        return Decision('a motion' if moves else None, 'it helps' if moves else 'all within tolerance', 10.0)
 
 
 def carried_out(campaign, answers=(), most=60):

@@ -96,7 +96,7 @@ def test_next_motions_end_when_all_is_known_and_take_says_what_is(plan, table):
     # the rests with which a session begins are made in any case: the proof holds out some of the windows
     assert [planner.next_motion(position).motion.kind for _ in range(LEAST_RESTS - 1)] == [MotionKind.POSE] * (LEAST_RESTS - 1)
     assert planner.next_motion(position).motion is None
-    assert planner.next_motion(position).reason == GOAL_REACHED
+    assert planner.next_motion(position).why == GOAL_REACHED
     far = replace(known, covariance=100.0 * known.covariance)
     planner.take(far)
     assert planner.next_motion(position).motion is not None
