@@ -34,13 +34,9 @@ class AxisFigures(AxisNoise):
         for name in (QUANTISATION.name, WHITE.name, *self.form):
             term = self.terms.get(name)
             if term is not None and term.value is not None:
-                found.append((self._process(name), term.value**2))
+                time = self.terms[TIME_KEY] if name == GAUSS_MARKOV else None
+                found.append((PROCESSES[name] if time is None else gauss_markov(time.value or time.interval[0]), term.value**2))
         return found
-
-    def _process(self, name):
-        if name == GAUSS_MARKOV:
-            return gauss_markov(self.terms[TIME_KEY].value or self.terms[TIME_KEY].interval[0])
-        return PROCESSES[name]
 
     @property
     def white(self) -> float:

@@ -246,18 +246,15 @@ def _require_scatter(curve):
 def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:
     """Return what is written to noise.yaml: the figures of all axes and the excluded parts."""
     record, times = result.record, RecordingTimes(result.record.curve.period)
-    axes = [_axis_figures(record, k, axis, times) for k, axis in enumerate(result.axes)]
+    axes = [AxisFigures(**vars(axis), trends=trends, record_for=_record_for(axis, times), sample_sd=float(sample_sd),
+                        deviation=tuple(np.sqrt(variance).tolist()))
+            for axis, trends, sample_sd, variance in zip(result.axes, record.trends, record.sample_sd, record.curve.variance.T)]
     recording = {'seconds_at_rest': float(record.curve.seconds), 'parts': len(record.parts),
                  'longest_part': float(max(part.seconds for part in record.parts)),
                  'left_out': record.left_out, 'dropped': dict(record.survey.dropped),
                  'intervals_hold_for': 'this recording; the slow noise of another one can be outside'}
     return NoiseFigures(tuple(axes[:3]), tuple(axes[3:]), 1.0 / record.curve.period, record.survey.frame_id, recording,
                         tuple(float(tau) for tau in record.curve.tau), {'software': f'imu_calibration {__version__}'} | (provenance or {}))
-
-
-def _axis_figures(record, k, axis, times):
-    return AxisFigures(**vars(axis), trends=record.trends[k], record_for=_record_for(axis, times), sample_sd=float(record.sample_sd[k]),
-                       deviation=tuple(float(v) for v in np.sqrt(record.curve.variance[:, k])))
 
 
 def _record_for(axis, times):

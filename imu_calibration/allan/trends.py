@@ -10,6 +10,8 @@ from imu_calibration.allan.processes import FLICKER, RANDOM_WALK, WHITE, NoisePr
 MAX_TREND_BLOCKS = 200
 MIN_TREND_SDS = {'temperature': 3.3, 'turn_on': 4.0, 'ramp': 4.0}
 """A trend counts from this many standard deviations on: 1 in 1000, also with the shapes of turn-on that are tried."""
+MIN_WARMTH_RANGE = 0.1
+"""Range of the temperature, K, above which a trend with it is tested."""
 MIN_SPARE_BLOCKS = 12
 """Trends are tested only with this many more blocks than constants."""
 SETTLING_SHARES = (1 / 40, 1 / 20, 1 / 10, 1 / 5)
@@ -113,8 +115,9 @@ class TrendSearch:
         if not self.usable or not np.any(np.ptp(self.blocks.mean[:, axis])):
             return ()
         chosen: list[tuple[str, float]] = []
+        warmth = self.blocks.temperature_c
         while True:
-            asked = [TEMPERATURE_TREND] if not chosen and self._warmth_varies() else []
+            asked = [TEMPERATURE_TREND] if not chosen and warmth is not None and np.ptp(warmth) > MIN_WARMTH_RANGE else []
             found = self._clearest(axis, chosen, asked) or self._clearest(axis, chosen, [TURN_ON_TREND, RAMP_TREND])
             if found is None:
                 break
@@ -123,9 +126,6 @@ class TrendSearch:
             return ()
         values, sd, _ = self.regress(axis, chosen)
         return tuple(AxisTrend(name, float(v), float(s), constant) for (name, constant), v, s in zip(chosen, values, sd))
-
-    def _warmth_varies(self):
-        return self.blocks.temperature_c is not None and np.ptp(self.blocks.temperature_c) > 0.1
 
     def _clearest(self, axis, chosen, names):
         """Return the (name, time constant) of the most significant coefficient given the selected ones, or None."""

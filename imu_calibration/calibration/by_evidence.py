@@ -252,7 +252,7 @@ def baseline_model(options: CalibrationOptions, table: Table, solved: SensorMode
 
 
 def _strange(found):
-    """Return effect -> how much of the rest it explains with a size that is known of no instrument, of several investigations."""
+    """Return implausible effect -> share of the excess variance that it explains; the first of several investigations has priority."""
     return {question.name: each.explained.share(each.named, question) for each in reversed(found) for question in each.implausible}
 
 

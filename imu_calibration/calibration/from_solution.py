@@ -22,7 +22,6 @@ from imu_calibration.estimation.solution import Solution, reasons_held, statuses
 from imu_calibration.estimation.weighted_system import make_prior
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import unusable, warnings
-from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.window_cutter import dropped
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
@@ -154,7 +153,8 @@ def document(solution: Solution, tolerances: np.ndarray, gathered: SessionData, 
     values, slope = centred(final, solution.values, uncorrected.centre)
     terms = {name: slope @ term @ slope.T for name, term in solution.terms.items()}
     moved = replace(solution, values=values, terms=terms)
-    found = {**statistics, **preflight_statistics(gathered.findings), **changes.to_mapping(), **uncorrected.to_mapping()}
+    found = {**statistics, 'preflight': [finding.to_mapping() for finding in warnings(gathered.findings)],
+             'unusable': unusable(gathered.findings), **changes.to_mapping(), **uncorrected.to_mapping()}
     calibration = Calibration(replace(final, centre=dict(uncorrected.centre)), values, moved.covariance,
                               statuses(moved.judged_sd, moved.held, tolerances), gathered.frame_id, gauge, undetermined, found,
                               conditions(gathered, gravity), {'software': imu_calibration.__version__, **(provenance or {})},
@@ -224,11 +224,6 @@ def statistics(solution: Solution, gathered: SessionData) -> dict:
     result['dropped'] = dropped(gathered.counts)
     result['stream'] = {key: value for key, value in sorted(gathered.counts.items()) if key not in result['dropped']}
     return result
-
-
-def preflight_statistics(findings: Sequence[CheckFinding]) -> dict:
-    """Return the findings of the checks of the recording as a part of the statistics."""
-    return {'preflight': [finding.to_mapping() for finding in warnings(findings)], 'unusable': unusable(findings)}
 
 
 def conditions(gathered: SessionData, gravity: float) -> dict:

@@ -81,11 +81,6 @@ def first_noise(system: WeightedSystem, values: np.ndarray, known: dict[str, tup
                                 replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))) for sensor in SENSORS}
 
 
-def updated_noise(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> dict[str, NoiseModel]:
-    """Return the noise estimated from the residuals at `values`."""
-    return {sensor: _updated(system, sensor, values, noises[sensor]) for sensor in SENSORS}
-
-
 def _at_rest(system, sensor, values):
     white = white_noise(system.accumulator.rows, sensor)
     reference = ReferenceNoise.of_steps(max(row.encoder_step for row in system.accumulator.rows), sensor)
@@ -103,7 +98,8 @@ def _with_bands(system, sensor, noise):
     return replace(noise, moving={kind: misfit.without_fast().factors(noise) for kind, misfit in misfits.items() if misfit.apart.any()})
 
 
-def _updated(system, sensor, values, noise):
+def updated_noise(system: WeightedSystem, sensor: str, values: np.ndarray, *, noise: NoiseModel) -> NoiseModel:
+    """Return the noise of a sensor estimated from the residuals at `values`, starting from `noise`."""
     if white_noise(system.accumulator.rows, sensor) is None:
         noise = replace(_at_rest(system, sensor, values), known=noise.known, left_out=noise.left_out)
     noise = replace(noise, moving={kind: _judged(system, sensor, kind, values).factors(noise) for kind in system.within[sensor]})

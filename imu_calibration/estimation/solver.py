@@ -246,7 +246,7 @@ def _with_noise(system, values, noises, free):
     """
     for _ in range(NOISE_ROUNDS):
         values = _minimised(system, values, _factors(system, noises), free, enough=0.01)
-        before, noises = noises, updated_noise(system, values, noises)
+        before, noises = noises, {s: updated_noise(system, s, values, noise=noises[s]) for s in SENSORS}
         if all(noises[s].weighs_alike(before[s]) for s in SENSORS):
             break
     return values, noises
