@@ -110,15 +110,15 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
 
 def _table(options, bags):
     """Return the chain of joints; a description in recordings is read from the first readable one."""
-    stand = stand_of(options)
+    stand, topics = stand_of(options), topics_of(choices_of(options))
     if stand is None:
         raise InputError('a fleet is calibrated on a table or an arm, got none; describe it', key='table')
     for bag in bags[:-1]:
         try:
-            return table_of(stand, [bag], topics_of(choices_of(options)))
+            return table_of(stand, [bag], topics)
         except InputError:
             pass
-    return table_of(stand, bags[-1:], topics_of(choices_of(options)))
+    return table_of(stand, bags[-1:], topics)
 
 
 def parameter_rows(spreads: Sequence[Spread]) -> list[dict[str, Any]]:

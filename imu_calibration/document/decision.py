@@ -134,7 +134,7 @@ class Reason:
     next: str
     """The next step; empty when no action is needed."""
     key: str | None = None
-    """The input needed for it, a key of `errors.KEYS`."""
+    """The input needed for it, a key of `errors.ERROR_KEYS`."""
     sensors: tuple[str, ...] = SENSORS
     """Sensors with parameters that it concerns."""
 

@@ -33,7 +33,7 @@ ENOUGH_MESSAGES = 100
 IMU_TOPIC_ENDINGS = ('imu/data', 'imu/data_raw', 'imu/data_corrected')
 """Endings of topics that carry Imu messages by convention (REP 145)."""
 NOT_MEASURED = ('/imu/residual',)
-"""Endings of topics of that type which are no measurement."""
+"""Endings of Imu topics without measurements."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class StreamFindings:
     source: str
     """Its publishers and how reliable they are."""
     findings: tuple[CheckFinding, ...]
-    """PoseScan of preflight."""
+    """Findings of the checks of a recording."""
 
 
 def look(node: Node, spin_once: Any) -> list[StreamFindings]:

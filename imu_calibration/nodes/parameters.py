@@ -177,7 +177,7 @@ HINTS = {
     'planner_node': {**_ARM, 'table': "parameter 'table_file'", 'joint_topic': 'remap joint_states'},
     'simulator_node': {**_ARM, 'calibration': "parameter 'calibration_file'", 'table': "parameter 'table_file'"},
 }
-"""Node -> {key of `errors.KEYS`: its name in the node}; a node without an entry receives no such error."""
+"""Node -> {key of `errors.ERROR_KEYS`: its name in the node}; a node without an entry receives no such error."""
 
 
 def settings_of(node: str) -> list[type]:

@@ -26,7 +26,7 @@ from imu_calibration.selection.questions import special
 from imu_calibration.simulation.profiles import make_profile
 
 SESSION = 'quick'
-"""Profile on which the mates imitate the finding."""
+"""Profile on which the sizes of collinear effects are derived from the size of the finding."""
 
 
 def make_separator(table: Table, calibration: Calibration, causes: Sequence[tuple[str, str]], *, noise: Mapping[str, NoiseModel],
@@ -182,7 +182,7 @@ class Campaign:
         self._first: Callable[[np.ndarray], Any] | None = first
         self._separator: Planner | None = None
         self.findings: list[Suspect] | None = None
-        """PoseScan of the last diagnosis, the strongest first; None before the first diagnosis."""
+        """Findings of the last diagnosis, the strongest first; None before the first diagnosis."""
         self.separations = 0
         self.told_apart: tuple[str, ...] = ()
         """The collinear class of the last separating motion."""
@@ -283,7 +283,7 @@ class Campaign:
 
 
 MAX_SEPARATING_SECONDS = 180.0
-"""Causes that no plan of this length separates count as one cause for this table, s."""
+"""Longest plan that separates causes, s; causes that need more count as one cause for this table."""
 
 
 def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, noise: dict[str, NoiseModel], rate: float = 100.0,

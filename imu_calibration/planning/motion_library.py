@@ -121,7 +121,7 @@ def place_words(names: tuple[str, ...], place: np.ndarray, limits: MotionLimits)
 
 
 N_TRIED = 512
-"""Positions that places are chosen from: a power of two, as the sequence wants it."""
+"""Number of positions from which places are chosen: a power of two, as the Sobol sequence requires."""
 POSITION_GRID = np.pi / 4
 """On a table with few joints the positions are multiples of this, so that they include faces, edges and corners."""
 ENDLESS_END = 1e9
@@ -162,8 +162,8 @@ def choose_places(table: Table, limits: MotionLimits) -> np.ndarray:
     """
     Return positions whose attitudes have the largest distances, the first at home, shape (n, n_joints).
 
-    Each next position has the attitude furthest from the chosen ones; of equals the one nearest to zero, which the order of
-    `candidates` sees to. Where all attitudes that are left are as good as there already, fewer are returned.
+    Each next position has the attitude furthest from those of the chosen positions; of equally distant attitudes the position nearest to
+    zero is chosen, by the order of `candidates`. Fewer positions are returned where the remaining attitudes are close to chosen ones.
     """
     tried = candidates(limits)
     mats = reference_motion(table, rest_at(tried)).mat_sn
@@ -179,7 +179,7 @@ def choose_places(table: Table, limits: MotionLimits) -> np.ndarray:
 LIMIT_SHARE = 0.98
 """Share of speeds and accelerations that is used, so that splines between the points of a trajectory keep the limits too."""
 DWELLS = (1.8, 2.5, 4.0, 6.5, 10.0, 16.0)
-"""Seconds of rest; the first half second settles, and a second is the shortest window."""
+"""Durations of a rest, s: half a second to settle, and at least one second of window."""
 SPIN_TIME = (2.0, 7.0)
 """Seconds for which a constant rate is held at least."""
 SWING_TIME = (4.0, 10.0)

@@ -20,7 +20,7 @@ from both sides, and arms sag."""
 MIN_PACE = 0.05
 """Least share of its speed at which a path is thought to be followed."""
 MIN_BEGUN_MOVEMENT = 0.4
-"""Tolerances from where they were by which joints have begun to move."""
+"""Movement from which joints count as moving, in tolerances."""
 STALLED_SECONDS = 1.0
 """Seconds of motion that identify a joint that does not move."""
 MAX_REST_RATE = 0.05
@@ -79,7 +79,7 @@ class PathWatch:
 
     @property
     def at_end(self) -> bool:
-        """Whether they have reached the last point."""
+        """Whether the joints have reached the last point of the path."""
         return self._at == len(self._time) - 1
 
     @property

@@ -28,9 +28,9 @@ from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 MAX_PLAN_MOTIONS = 400
 """Motions of a plan at most."""
 FURTHER = 1.02
-"""Factor on standard deviations when the belief thinks itself at the goal and the exact weights do not."""
+"""Factor on the standard deviations of the search, applied when they meet the goal and the exact covariance does not."""
 MIN_PLAN_GAIN = 2e-3
-"""A motion must lower the sum of logarithms of excess over tolerance by so much to be worth it, near the goal by this share of it."""
+"""Least reduction of the distance to the goal by a motion; near the goal the least share of the distance."""
 
 
 class CandidateMotions:

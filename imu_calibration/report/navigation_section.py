@@ -64,16 +64,13 @@ def rest_growth(errors: WindowErrors) -> Growth | None:
     if not len(static):
         return None
     time = np.linspace(0.0, REST_RUN_SECONDS, RUN_INSTANTS)
-    before = errors.before
-    return _growth(time,
-                   [_rest_run(time, errors.true['accelerometer'][k], before['accelerometer'][k], before['gyroscope'][k]) for k in static])
-
-
-def _rest_run(time, force, force_error, rate_error):
-    gravity = float(np.linalg.norm(force))
-    attitude = _attitudes(force[None] / gravity)[0].T
-    count = len(time)
-    return strapdown(time, np.tile(force + force_error, (count, 1)), np.tile(rate_error, (count, 1)), gravity=gravity, mat_ns0=attitude)
+    runs = []
+    for force, force_error, rate_error in zip(*(part[static] for part in (
+            errors.true['accelerometer'], errors.before['accelerometer'], errors.before['gyroscope']))):
+        gravity = float(np.linalg.norm(force))
+        readings = (np.tile(reading, (len(time), 1)) for reading in (force + force_error, rate_error))
+        runs.append(strapdown(time, *readings, gravity=gravity, mat_ns0=_attitudes(force[None] / gravity)[0].T))
+    return Growth(time, *(np.linalg.norm(run, axis=-1) for run in zip(*runs)))
 
 
 def expected_growth(result: CalibrationResult, errors: WindowErrors) -> tuple[Growth, dict[str, Growth]]:
@@ -117,10 +114,6 @@ def noise_densities(result: CalibrationResult) -> list[float]:
     found = [result.calibration.statistics[sensor] for sensor in ('accelerometer', 'gyroscope')]
     return [float(np.sqrt(np.mean(np.square(f['noise_sd']) * np.asarray(f.get('low_frequency_factor', 1.0))) * result.period))
             for f in found]
-
-
-def _growth(time, runs):
-    return Growth(time, *(np.linalg.norm(errors, axis=-1) for errors in zip(*runs)))
 
 
 def motion_growth(result: CalibrationResult) -> tuple[Growth, Growth] | None:

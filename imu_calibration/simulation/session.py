@@ -20,11 +20,11 @@ from imu_calibration.simulation.motion_builder import Profile
 from imu_calibration.simulation.sensor_noise import GRADES, ImuNoise, SimulatedNoise, gauss_markov, jitter_stamps, read_encoders
 
 LOUDEST = 0.25
-"""Its rms in the band of each axis in its loudest gear, m/s^2."""
+"""Rms of the machine's vibration on each axis in its loudest gear, m/s^2."""
 GEAR_AMPLITUDES, GEAR_SECONDS = (0.0, 1.0, 0.5, 0.0, 0.75), 11.0
-"""Sequence of relative amplitudes of its gears, and time in each gear, s."""
+"""Relative amplitudes of the gears of the machine in their order, and time in each gear, s."""
 ALIASED = 0.31
-"""Frequency to which the sampling brings it, of the sample rate."""
+"""Frequency of the vibration after aliasing, as a share of the sample rate."""
 
 
 def hum_and_variance(time: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,1 +1,1 @@
-"""One module for each program or family of programs; `registry` finds them by itself."""
+"""One module for each program or family of programs; `export.all_targets` imports every module of this folder."""
