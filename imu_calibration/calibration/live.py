@@ -226,7 +226,7 @@ class LiveCalibration:
         return self._with_earlier(self._collector.snapshot(pending)[0])
 
     def saved(self, pending: bool = False) -> bytes:
-        """Return all gathered data as bytes, for another run (see `accumulator_state`)."""
+        """Return all gathered data as bytes, for another run (`collector.to_bytes`)."""
         return collector.to_bytes(self.gathered(pending), self._begun().model, self.extension)
 
     def _begun(self) -> LiveCollector:

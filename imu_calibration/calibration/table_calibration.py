@@ -152,7 +152,7 @@ def solve_gathered(gathered: SessionData, model: SensorModel, options: Calibrati
 
 def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions = CalibrationOptions()) -> Calibration:
     """
-    Return the calibration of a saved live session (`accumulator_state`), with the model of its columns and the added effects.
+    Return the calibration of a saved live session (`LiveCalibration.saved`), with the model of its columns and the added effects.
 
     Raises
     ------
