@@ -65,7 +65,8 @@ def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]
 
     """
     kinds = {window.kind for window in windows}
-    span = _temperature_span(windows)
+    means = [float(np.mean(window.temperature_c)) for window in windows if window.temperature_c is not None]
+    span = max(means) - min(means) if means and len(means) == len(windows) else None
     have = {e.key for e in model.effects}
     branches = [float(window.motion.thermal_branch.mean()) for window in windows if window.motion.thermal_branch is not None]
     turned, shaken = bool(branches) and max(branches) - min(branches) >= BRANCHES_APART, _vibrates(windows)
@@ -89,13 +90,6 @@ def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], l
         else:
             lacking.append({'effect': effect.name, 'why': why[0], 'needs': why[1]})
     return known, lacking
-
-
-def _temperature_span(windows):
-    if any(window.temperature_c is None for window in windows):
-        return None
-    means = [float(np.mean(window.temperature_c)) for window in windows]
-    return max(means) - min(means) if means else None
 
 
 def _vibrates(windows):

@@ -1,5 +1,7 @@
 """Test of the gyroscope's g-sensitivity at rest, given a drift in time: the order of the attitudes may correlate with a warm-up."""
 
+from itertools import product
+
 import numpy as np
 import scipy.linalg
 from scipy.special import fdtrc
@@ -51,7 +53,9 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
     up, first = full[:, course.shape[1]:], course.shape[1]
     upwards = np.trace(np.linalg.lstsq(full, poses.rate, rcond=None)[0][first:]) / 3
     rate = poses.rate - np.clip(upwards, -EARTH_RATE, EARTH_RATE) * up
-    covariance = min(_covariances(time), key=lambda candidate: _loss(candidate, full, rate))
+    apart = np.abs(time[:, None] - time)
+    candidates = ((1 - share) * np.eye(count) + share * np.exp(-apart / tau) for share, tau in product(SHARES, RELATIVE_TIMES))
+    covariance = min(candidates, key=lambda candidate: _loss(candidate, full, rate))
     (least, kept_out), (rest, rest_out) = (_left(covariance, design, rate) for design in (full, course))
     dof = count - full.shape[1] - CHOSEN
     scale = least / dof + 1e-300
@@ -63,14 +67,6 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
 def shown(evidence: dict) -> bool:
     """Return whether the g-sensitivity is significant enough to enter the model without a request."""
     return evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P_VALUE and evidence['g_sensitivity_heldout_ratio'] < 1
-
-
-def _covariances(time):
-    apart = np.abs(time[:, None] - time)
-    yield np.eye(len(time))
-    for share in SHARES[1:]:
-        for tau in RELATIVE_TIMES:
-            yield (1 - share) * np.eye(len(time)) + share * np.exp(-apart / tau)
 
 
 def _loss(covariance, design, values):

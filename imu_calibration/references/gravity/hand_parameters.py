@@ -138,7 +138,9 @@ class HandModel:
         output, columns = np.zeros((len(force), 3)), [np.zeros((len(force), 3, 0))]
         if not effects:
             return output, columns[0]
-        ref = _reference(force, np.zeros_like(force) if rate is None else rate, time, temperature_c, self.gravity)
+        time = np.zeros(len(force)) if time is None else np.asarray(time, float)
+        rate = np.zeros_like(force) if rate is None else rate
+        ref = Reference(time, np.zeros((len(force), 3, 3)), force, rate, np.zeros_like(force), self.gravity, temperature_c)
         point, own = self.model.full_point(), self.model.values_of(sensor, values)
         for effect in effects:
             basis = {group.name: group.columns(ref, point) for group in effect.groups}
@@ -190,9 +192,3 @@ class HandModel:
         columns[:, :, self.gyro_bias] = np.eye(3)
         columns[:, :, self.extra_index('gyroscope')] = slopes
         return rate - values[self.gyro_bias] - more, columns
-
-
-def _reference(force, rate, time, temperature_c, gravity):
-    time = np.zeros(len(force)) if time is None else np.asarray(time, float)
-    return Reference(time, np.zeros((len(force), 3, 3)), force, rate, np.zeros_like(force), gravity, temperature_c)
-
