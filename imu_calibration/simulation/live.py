@@ -12,7 +12,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import lever_matrix
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.sensor_noise import Cause, Felt, ImuNoise, jitter_stamps
-from imu_calibration.simulation.session import SimulationOptions, answered, joint_samples, temperature_at
+from imu_calibration.simulation.session import SimulationOptions, answered, joint_samples, stamps_at, temperature_at
 from imu_calibration.simulation.table_controller import TableController
 
 TEMPERATURE_RATE = 1.0
@@ -76,9 +76,6 @@ class LiveSimulation:
         self._n[stream] = stop
         return (np.arange(first, stop) + offset) / rate
 
-    def _stamps(self, time):
-        return self.start_ns + np.round(time * 1e9).astype(np.int64)
-
     def _imu(self, time):
         if not len(time):
             empty = ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), self.options.frame_id)
@@ -86,7 +83,7 @@ class LiveSimulation:
         motion = self.motion.at(time)
         noisy = self._noise.add(*self._answered(time, motion))
         force, rate = (clip(self.model, sensor, self.values, output=output) for sensor, output in zip(SENSORS, noisy))
-        stamps = jitter_stamps(self._stamps(time), self.options.noise.stamp_jitter, self._rng)
+        stamps = jitter_stamps(stamps_at(time, self.start_ns), self.options.noise.stamp_jitter, self._rng)
         return ImuSamples(stamps, force, rate, self.options.frame_id), self._truth(stamps, motion)
 
     def _answered(self, time, motion):
@@ -117,4 +114,4 @@ class LiveSimulation:
         if self.options.temperature_start_c is None:
             return None
         time = self._times('temperature', TEMPERATURE_RATE, 0.0, until)
-        return TemperatureSamples(self._stamps(time), temperature_at(time, self.options))
+        return TemperatureSamples(stamps_at(time, self.start_ns), temperature_at(time, self.options))

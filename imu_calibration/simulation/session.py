@@ -139,21 +139,25 @@ def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: P
     time = np.arange(n_imu) / options.imu_rate
     noisy = ImuNoise(options.noise, sample_rate=options.imu_rate, rng=rng).add(*_outputs(model, values, table, profile, time, options))
     force, rate = (clip(model, sensor, values, output=output) for sensor, output in zip(SENSORS, noisy))
-    stamps = jitter_stamps(SESSION_START_NS + np.round(time * 1e9).astype(np.int64), options.noise.stamp_jitter, rng)
+    stamps = jitter_stamps(stamps_at(time), options.noise.stamp_jitter, rng)
     imu = ImuSamples(stamps, force, rate, options.frame_id)
     joints = joint_samples(profile.at((np.arange(n_joint) + 0.5) / options.joint_rate), table, options, start_ns=SESSION_START_NS, rng=rng)
     seconds = np.arange(0, profile.duration)
     warmth = temperature_at(seconds, options)
-    stamp_ns = SESSION_START_NS + seconds.astype(np.int64) * 1_000_000_000
-    return imu, joints, None if warmth is None else TemperatureSamples(stamp_ns, warmth)
+    return imu, joints, None if warmth is None else TemperatureSamples(stamps_at(seconds), warmth)
 
 
 def joint_samples(motion: JointMotion, table: Table, options: SimulationOptions, *, start_ns: int,
                   rng: np.random.Generator) -> JointSamples:
     """Return a motion as its encoders measure it; `start_ns` is the stamp of time zero."""
-    stamp_ns, position = start_ns + np.round(motion.time * 1e9).astype(np.int64), read_encoders(motion.position, options.noise, rng)
+    position = read_encoders(motion.position, options.noise, rng)
     velocity = motion.rate if options.with_velocity else np.full_like(motion.rate, np.nan)
-    return JointSamples(stamp_ns, position, velocity, tuple(table.joint_names))
+    return JointSamples(stamps_at(motion.time, start_ns), position, velocity, tuple(table.joint_names))
+
+
+def stamps_at(time: np.ndarray, start_ns: int = SESSION_START_NS) -> np.ndarray:
+    """Return the stamps of times, s; `start_ns` is the stamp of time zero."""
+    return start_ns + np.round(time * 1e9).astype(np.int64)
 
 
 def _outputs(model, values, table, profile, time, options):
