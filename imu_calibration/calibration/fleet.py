@@ -46,7 +46,7 @@ class UnitResult:
     error: str = ''
     """Why the unit was refused, one line."""
     key: str | None = None
-    """The missing input, a key of `errors.KEYS`."""
+    """The missing input, a key of `errors.ERROR_KEYS`."""
     files: dict | None = None
     """File name -> text."""
 

@@ -219,7 +219,7 @@ class CheckFinding:
     samples: int = 0
     """Samples that are unusable because of it and that no other count holds."""
     key: str | None = None
-    """The missing input, a key of `errors.KEYS`."""
+    """The missing input, a key of `errors.ERROR_KEYS`."""
 
     def named(self, name: str) -> 'CheckFinding':
         """Return the finding with the name of its recording before the text."""
