@@ -209,8 +209,11 @@ def runs_of(flags: ArrayLike) -> np.ndarray:
 
 def smallest_step(readings: np.ndarray, least: float = 1e-9) -> np.ndarray:
     """Return the smallest step from one reading to the next in each column, (n, k), above the share `least` of the largest, shape (k,)."""
-    steps, largest = np.abs(np.diff(readings, axis=0)), np.abs(readings).max(axis=0, initial=1e-12)
-    return np.min(steps, axis=0, where=steps > least * largest, initial=np.inf)
+    steps = []
+    for column in readings.T:   # one at a time: the temporary arrays of a long recording are large
+        step = np.abs(np.diff(column))
+        steps.append(np.min(step, where=step > least * np.abs(column).max(initial=1e-12), initial=np.inf))
+    return np.array(steps)
 
 
 def rounding_variance(readings: np.ndarray) -> np.ndarray:
