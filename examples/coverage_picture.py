@@ -11,7 +11,7 @@ from visualization_msgs.msg import Marker
 from imu_calibration.calibration.advice import foretold
 from imu_calibration.calibration.coverage import DIRECTIONS, Coverage, Step
 from imu_calibration.calibration.hand_step import HandStep
-from imu_calibration.calibration.pose_scan import NO_FINDINGS, knowledge_of
+from imu_calibration.calibration.pose_scan import EMPTY_SCAN, knowledge_of
 from imu_calibration.nodes.calibration_status import markers_of
 from imu_calibration.references.gravity.hand_options import HandOptions
 
@@ -23,7 +23,7 @@ MINIMUM = 8.0
 def states():
     """Yield a Coverage at the beginning, after six poses and at the end of a session that follows the recommended motions."""
     up = np.array([0.0, 0.0, 1.0])
-    knowledge, seen = knowledge_of(NO_FINDINGS, None, HandOptions(gravity=9.81)).then(HandStep(up)), [up]
+    knowledge, seen = knowledge_of(EMPTY_SCAN, None, HandOptions(gravity=9.81)).then(HandStep(up)), [up]
     yield shown(knowledge, seen)
     for step in foretold(knowledge)[:6]:
         knowledge = knowledge.then(step)

@@ -10,7 +10,7 @@ import numpy as np
 
 from imu_calibration.calibration.coverage import Coverage, GroupState, group_states, waiting_groups
 from imu_calibration.calibration.hand_workflow import HandRecording, HandResult, evident_result
-from imu_calibration.calibration.pose_scan import NO_FINDINGS, hand_coverage, hand_status, look_for_poses
+from imu_calibration.calibration.pose_scan import EMPTY_SCAN, hand_coverage, hand_status, look_for_poses
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SolvePacer
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.progress import LiveState
@@ -72,7 +72,7 @@ class LiveByHand:
             self._store.load(saved)
         self._pacer, self._unsearched, self._reported_ns = SolvePacer(SEARCH_SHARE), 0, None
         self._shown: tuple[tuple, Coverage] | None = None
-        self.found = NO_FINDINGS
+        self.found = EMPTY_SCAN
         self.result: HandResult | None = None
         self._search(self._store)
 

@@ -48,14 +48,14 @@ class PoseScan:
     """Duration of the current rest, s; 0 in motion."""
 
 
-NO_FINDINGS = PoseScan([], None, 0, 0, {}, 0.0)
+EMPTY_SCAN = PoseScan([], None, 0, 0, {}, 0.0)
 
 
 def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> PoseScan:
     """Return the PoseScan in ImuSamples with rising stamps."""
     rests = [rest for rest in find_still(imu, windows) if rest.stop - rest.start >= 2]
     if not rests:
-        return NO_FINDINGS
+        return EMPTY_SCAN
     seconds = 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
     poses = average_poses(imu, [(rest.start, rest.stop) for rest in rests])
     turns, dropped = collect_turns(seconds, imu, poses=poses)

@@ -215,7 +215,7 @@ class Preflight:
         self.findings: tuple[CheckFinding, ...] = ()
         self.streams: dict[str, StreamStatistics] = {}
         self.lost: dict[str, int] = {}
-        """PoseScan; name -> StreamStatistics; reason -> number of unreadable messages: complete after `finish`."""
+        """Findings; name -> StreamStatistics; reason -> number of unreadable messages: complete after `finish`."""
 
     def push(self, cleaned: CleanedBlock) -> None:
         """Process a CleanedBlock."""

@@ -40,7 +40,7 @@ class ResidualAnalysis(Investigation):
 
     @classmethod
     def of(cls, found: Investigation, table: Table) -> 'ResidualAnalysis':
-        """Return an Investigation as an ResidualAnalysis; an ResidualAnalysis is returned unchanged."""
+        """Return an Investigation as a ResidualAnalysis; a ResidualAnalysis is returned unchanged."""
         return found if isinstance(found, cls) else cls(**{each.name: getattr(found, each.name) for each in fields(found)}, table=table)
 
     @cached_property
@@ -132,7 +132,7 @@ class ResidualAnalysis(Investigation):
         return found
 
     def without(self, gone: Sequence[Question]) -> 'ResidualAnalysis':
-        """Return the ResidualAnalysis without some findings; they remain doubtful, and widen the uncertainty of all other ones."""
+        """Return the ResidualAnalysis without some findings; they become rejected, and widen the uncertainty of all other ones."""
         names = {question.name for question in gone}
         other = replace(self, named=[question for question in self.named if question not in gone], rejected=[*self.rejected, *gone],
                         rivals=[rival for rival in self.rivals if rival.question.name not in names])

@@ -26,7 +26,7 @@ from imu_calibration.calibration.coverage import (
 )
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.calibration.hand_workflow import HandResult
-from imu_calibration.calibration.pose_scan import NO_FINDINGS, hand_coverage
+from imu_calibration.calibration.pose_scan import EMPTY_SCAN, hand_coverage
 from imu_calibration.calibration.result import CalibrationResult, exit_code
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import InputError
@@ -388,7 +388,7 @@ def _document_of(path):
 
 def _coverage(result: CalibrationResult) -> Coverage:
     if isinstance(result, HandResult):
-        found = hand_coverage(replace(NO_FINDINGS, poses=result.hand.poses), result, HandOptions(tolerances=result.options.tolerances))
+        found = hand_coverage(replace(EMPTY_SCAN, poses=result.hand.poses), result, HandOptions(tolerances=result.options.tolerances))
     else:
         assert isinstance(result, TableResult), 'a calibration is made by hand or on a table'
         found = table_coverage(result)

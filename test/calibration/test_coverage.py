@@ -10,7 +10,7 @@ from imu_calibration.calibration.advice import WEIGHTS, _rollout, foretold
 from imu_calibration.calibration.coverage import DIRECTIONS, MIN_CELL_WORTH, Coverage, Step, line_of, table_coverage
 from imu_calibration.calibration.hand_step import HandStep, direction_words, shortest_turn
 from imu_calibration.calibration.live_poses import LiveByHand
-from imu_calibration.calibration.pose_scan import NO_FINDINGS, hand_coverage, knowledge_of
+from imu_calibration.calibration.pose_scan import EMPTY_SCAN, hand_coverage, knowledge_of
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
@@ -28,12 +28,12 @@ OPTIONS = HandOptions(gravity=GRAVITY)
 
 def start():
     """What is known before anything came."""
-    return hand_coverage(NO_FINDINGS, None, OPTIONS)
+    return hand_coverage(EMPTY_SCAN, None, OPTIONS)
 
 
 def knowing(*ups, factor=1.0):
     """Knowledge after rests with some directions up, in order."""
-    knowledge = knowledge_of(NO_FINDINGS, None, OPTIONS)
+    knowledge = knowledge_of(EMPTY_SCAN, None, OPTIONS)
     for up in ups:
         up = np.array(up, float) / np.linalg.norm(up)
         knowledge = knowledge.then(HandStep(up))

@@ -1,4 +1,4 @@
-"""SessionData windows of sessions on a table: stored, held out for the proof, merged."""
+"""Data of sessions on a table: windows stored, held out for the proof, merged."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
