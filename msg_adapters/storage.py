@@ -2,8 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -116,11 +115,15 @@ def read_ahead(pieces: Generator[Piece, None, None]) -> Generator[Piece, None, N
 
     The thread ends with the generator, or soon after the consumer has closed this one.
     """
-    with closing(pieces), ThreadPoolExecutor(1) as thread:
-        waiting = deque(thread.submit(next, pieces, _END) for _ in range(PIECES_AHEAD))
+    with ThreadPoolExecutor(1) as thread:
+        waiting: deque[Future] = deque()
         try:
+            for _ in range(PIECES_AHEAD):
+                waiting.append(thread.submit(next, pieces, _END))
             while (piece := waiting.popleft().result()) is not _END:
                 waiting.append(thread.submit(next, pieces, _END))
                 yield piece
         finally:
-            thread.shutdown(cancel_futures=True)
+            for future in waiting:
+                future.cancel()
+            thread.submit(pieces.close)   # not here: an interruption may have left the thread within the generator
