@@ -119,7 +119,7 @@ class PlanningProblem:
         return self.coordinates.prior_information + (0.0 if self.known is None else self.known)
 
     def posterior(self) -> Posterior:
-        """Return the belief before any motion."""
+        """Return the posterior before any motion."""
         return Posterior(self.prior, self.noise)
 
     def place_near(self, position: np.ndarray) -> int:
