@@ -25,6 +25,7 @@ from imu_calibration.document.trust import uncorrected_lines
 from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
 from imu_calibration.estimation.solution import COMMON_SCALE, DETERMINED, HELD, Status
 from imu_calibration.preprocessing.window import UnusedReason
+from imu_calibration.selection.stamp_jitter import jitter_text
 
 MAX_MISFIT_RATIO = 10.0
 """Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
@@ -89,8 +90,7 @@ def unexplained_text(sensor: str, rms: float, unit: str | None = None) -> str:
 def _jitter(calibration):
     """Return a note on independent errors of the stamps."""
     found = calibration.statistics.get('stamp_jitter')
-    return [Reason(NOTE, f'the stamps have independent errors of {1e6 * found["sd_s"]:.0f} us (1 sd), which explain scatter in motion',
-                   "use stamps of the sensor's own clock")] if found else []
+    return [Reason(NOTE, jitter_text(found['sd_s']), "use stamps of the sensor's own clock")] if found else []
 
 
 def _with_size(calibration, name):

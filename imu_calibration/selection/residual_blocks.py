@@ -139,9 +139,10 @@ def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProb
     columns_of = _block_means(problem, table, motion, temperature, common['starts'])
     left = residuals(windows, table, problem.recording.model, values=problem.recording.values)
     inner = _inner(windows)
-    rough = {sensor: _roughness(residual, inner, edges, least=LEAST_NOISE[sensor]) for sensor, residual in left.items()}
+    number = np.add.reduceat(inner, edges)
+    rough = {sensor: _roughness(residual, inner, edges, number=number, least=LEAST_NOISE[sensor]) for sensor, residual in left.items()}
     slope = {sensor: _slope(residual, windows, edges, sensor) for sensor, residual in left.items()}
-    freedom = np.add.reduceat(inner, edges) / PER_FREEDOM
+    freedom = number / PER_FREEDOM
     jitter = stamp_jitter(list(rough.values()), list(slope.values()), freedom)
     louder = {sensor: jitter_ratio(rough[sensor], slope[sensor], jitter.sd) for sensor in left}
     kinds = problem.recording.kind[common['window']]
@@ -162,11 +163,11 @@ def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProb
     return found
 
 
-def _roughness(residual, inner, edges, least):
-    """Return the variance by second differences in blocks that begin at the samples `edges`, at least rounding, shape (b, 3)."""
+def _roughness(residual, inner, edges, *, number, least):
+    """Return the variance by the `number` of second differences in blocks that begin at the samples `edges`, at least rounding, (b, 3)."""
     bends = np.diff(residual, 2, axis=0, prepend=residual[:1], append=residual[-1:])
     squares = np.add.reduceat(inner[:, None] * bends**2, edges, axis=0) / WHITE_BENDS
-    return np.maximum(squares / np.maximum(np.add.reduceat(inner, edges), 1)[:, None], least**2)
+    return np.maximum(squares / np.maximum(number, 1)[:, None], least**2)
 
 
 def _inner(windows):

@@ -1,6 +1,6 @@
 """Independent errors of the time stamps, from the scatter of the residual in motion; the scatter without them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,19 +26,26 @@ class StampJitter:
     """Their standard deviation, s."""
     significant: bool
     """Whether the scatter of each sensor alone shows errors of this size."""
-    ratio: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    ratio: dict[str, dict[str, float]] = field(default_factory=dict)
     """Sensor -> kind of moving window -> variance of the noise and these errors over that of the noise."""
 
     @property
     def lines(self) -> list[str]:
         """Description, empty where they are not significant."""
-        text = f'stamps: independent errors of {1e6 * self.sd:.0f} us (1 sd) explain the scatter of both sensors in motion'
-        return [text] * self.significant
+        return [jitter_text(self.sd)] * self.significant
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the entry of a calibration document, empty where they are not significant."""
-        ratio = {sensor: dict(kinds) for sensor, kinds in self.ratio.items()}
-        return {'sd_s': self.sd, 'variance_ratio': ratio} if self.significant else {}
+        return {'sd_s': self.sd, 'variance_ratio': self.ratio} if self.significant else {}
+
+
+NO_JITTER = StampJitter(0.0, False)
+"""Where no errors are estimated."""
+
+
+def jitter_text(sd: float) -> str:
+    """Return the statement of independent errors of the stamps of a standard deviation, s."""
+    return f'the stamps have independent errors of {1e6 * sd:.0f} us (1 sd), which explain scatter of both sensors in motion'
 
 
 def stamp_jitter(rough: Sequence[np.ndarray], slope: Sequence[np.ndarray], freedom: np.ndarray) -> StampJitter:

@@ -10,6 +10,7 @@ from imu_calibration.effects.base import SENSORS, UNITS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.gain import Gain
+from imu_calibration.selection.stamp_jitter import NO_JITTER, StampJitter
 from imu_calibration.selection.unexplained import Unexplained
 
 
@@ -98,8 +99,8 @@ class Diagnosis:
     """`traces.Traces`: residuals before and after, for plots; None during a live session."""
     onset: Any = None
     """Parameters that change at one moment (`selection.onset.Onset`), or None; the findings are those of the longer part."""
-    stamp_jitter: Any = None
-    """Errors of the stamps from the scatter in motion (`selection.stamp_jitter.StampJitter`); None by hand."""
+    stamp_jitter: StampJitter = NO_JITTER
+    """Errors of the stamps from the scatter in motion; by hand none are estimated."""
 
     @property
     def model(self) -> SensorModel:
@@ -137,7 +138,7 @@ def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
         'format': DIAGNOSIS_FORMAT,
         'baseline': {sensor: _baseline(diagnosis.baseline, sensor) for sensor in SENSORS},
         'onset': None if diagnosis.onset is None else diagnosis.onset.to_mapping(),
-        'stamp_jitter_s': diagnosis.stamp_jitter.sd if diagnosis.stamp_jitter and diagnosis.stamp_jitter.significant else None,
+        'stamp_jitter_s': diagnosis.stamp_jitter.to_mapping().get('sd_s'),
         'findings': [_finding(finding) for finding in diagnosis.findings],
         'gain': _gain(diagnosis.gain) if diagnosis.findings else None,
         'dead_reckoning': diagnosis.traces.dead_reckoning,

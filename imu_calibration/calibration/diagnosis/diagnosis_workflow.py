@@ -207,8 +207,7 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
 
 def timing_lines(diagnosis: Diagnosis) -> list[str]:
     """Return the moment at which parameters change, with their values before and after, and errors of the stamps, as lines."""
-    jitter = [] if diagnosis.stamp_jitter is None else diagnosis.stamp_jitter.lines
-    return [*_onset_lines(diagnosis.onset), *jitter]
+    return [*_onset_lines(diagnosis.onset), *diagnosis.stamp_jitter.lines]
 
 
 def _onset_lines(onset):
