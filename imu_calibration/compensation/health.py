@@ -307,9 +307,9 @@ class CalibrationHealth:
     @property
     def state(self) -> LiveState:
         """Result of the last stop, computed on request."""
-        return LiveState(WAITING, 'no stop of two seconds yet') if self._last is None else self._told(*self._last)
+        return LiveState(WAITING, 'no stop of two seconds yet') if self._last is None else self._evaluated(*self._last)
 
-    def _told(self, stop, of_mean, n_stops, bias_update):
+    def _evaluated(self, stop, of_mean, n_stops, bias_update):
         total = self._known + np.diag(of_mean)
         along = stop.mean[:3] / max(np.linalg.norm(stop.mean[:3]), 1e-9)
         rate_off = np.maximum(np.abs(stop.mean[3:]) - EARTH_RATE, 0) / np.sqrt(np.diag(total)[3:])

@@ -39,7 +39,7 @@ class CompensatorDiagnostics:
 
     def __init__(self, node: Any):
         self._node, self._counts = node, {}
-        self._received, self._last_change, self._told_source, self._told_stamps = 0, monotonic(), '', None
+        self._received, self._last_change, self._last_source, self._last_stamps = 0, monotonic(), '', None
         self._temperature: float | None = None
         self._temperature_at, self._unusable_temperatures = monotonic(), ''
         self._stamps_at: dict = {}
@@ -96,8 +96,8 @@ class CompensatorDiagnostics:
         if received != self._received:
             self._received, self._last_change = received, monotonic()
             source = node.imu.source()
-            if source != self._told_source and node.imu.publishers:
-                self._told_source = source
+            if source != self._last_source and node.imu.publishers:
+                self._last_source = source
                 node.get_logger().info(f'Imu messages are received on {source}')
         self._tell_stamps(compensation)
         return [node.imu.silence()] if monotonic() - self._last_change > QUIET else []
@@ -105,11 +105,11 @@ class CompensatorDiagnostics:
     def _tell_stamps(self, compensation):
         """Log irregular stamps once, and again when their rate changes."""
         line = None if compensation is None else compensation.slope.line
-        if line is not None and (shown := (line.word, round(np.log(line.period_ns) / ANOTHER_RATE))) != self._told_stamps:
-            if (line.word == COUNTED or self._told_stamps is not None) and monotonic() - self._stamps_at.get(shown, -np.inf) >= REMINDER:
+        if line is not None and (shown := (line.word, round(np.log(line.period_ns) / ANOTHER_RATE))) != self._last_stamps:
+            if (line.word == COUNTED or self._last_stamps is not None) and monotonic() - self._stamps_at.get(shown, -np.inf) >= REMINDER:
                 self._stamps_at[shown] = monotonic()
                 self._node.get_logger().info(str(line))
-            self._told_stamps = shown
+            self._last_stamps = shown
 
     def _lines(self, compensation):
         """Return (faults that prevent correction, notes), one line each."""

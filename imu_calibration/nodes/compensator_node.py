@@ -53,7 +53,7 @@ class CompensatorNode(Node):
         self._harmful = ''
         self._current: LiveCompensation | None = None
         self._wanted: LiveCompensation | None = None
-        self._told: Adopted | None = None
+        self._reported: Adopted | None = None
         self.problem, self.refusal, self.corrected_already, self._heard, self.awaited = '', '', '', '', ''
         announce(self, ['imu/data_raw', 'imu/calibration', 'imu/temperature'], ['imu/data_corrected'])
         self._frames = StaticFrames(self, self._guarded(self._on_transforms))
@@ -159,8 +159,8 @@ class CompensatorNode(Node):
         """Put the calibration in a document in force; raises an ImuCalibrationError and keeps the one there is."""
         adopted = adopt(text, source, settings, frames=self._frames, before=self.adopted)
         self._put_in_force(adopted)
-        if adopted.says_more_than(self._told):
-            self._told = adopted
+        if adopted.says_more_than(self._reported):
+            self._reported = adopted
             self.get_logger().info(adopted.line())
             for line in adopted.caveats:
                 self.get_logger().warning(f'calibration {adopted.version}: {line}')

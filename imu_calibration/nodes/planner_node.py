@@ -108,7 +108,7 @@ class PlannerNode(Node):
         self._options = CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None,
                                            settings.reference_model or None, tolerances,
                                            noise=files.read_noise(files.user_path(settings.noise_file)) if settings.noise_file else None)
-        self._lock, self._stamp, self._told = threading.RLock(), 0.0, {}
+        self._lock, self._stamp, self._status = threading.RLock(), 0.0, {}
         self._newest: str | None = None
         self._n_documents = 0
         self._is_halted = False
@@ -210,7 +210,7 @@ class PlannerNode(Node):
         for status in message.status:
             if status.name.endswith(wanted):
                 with self._heard:
-                    self._told = {pair.key: pair.value for pair in status.values}
+                    self._status = {pair.key: pair.value for pair in status.values}
                     self._heard.notify_all()
 
     def _tick(self) -> None:
@@ -275,15 +275,15 @@ class PlannerNode(Node):
         return self._latest()
 
     def _diagnose(self) -> list[Suspect] | None:
-        known = self._told.get('diagnoses', '0')
+        known = self._status.get('diagnoses', '0')
         answer = self._ask('diagnose')
         if answer is None or not answer.success:
             self._say(LOG_INFO, 'no diagnosis: ' + (answer.message if answer else 'no answer'))
             return None
         with self._heard:
-            came = self._heard.wait_for(lambda: self._told.get('diagnoses', '0') != known and self._told.get('being made') == 'False',
+            came = self._heard.wait_for(lambda: self._status.get('diagnoses', '0') != known and self._status.get('being made') == 'False',
                                         timeout=ANSWER_PATIENCE)
-            values = dict(self._told)
+            values = dict(self._status)
         return findings_from(values) if came else None
 
     # Requests of the user.

@@ -82,7 +82,7 @@ def solve_linear(design: np.ndarray, outputs: np.ndarray, param_names: tuple[str
 def numerical_rank(design: np.ndarray) -> int:
     """Return the rank of `design` after its columns are scaled to unit norm; zero columns count as zero."""
     singular = _scaled_svd(np.asarray(design, float))[2]
-    return int(np.sum(~_unseen(singular)))
+    return int(np.sum(~_negligible(singular)))
 
 
 def condition_numbers(design: np.ndarray) -> tuple[float, float]:
@@ -100,7 +100,7 @@ def null_directions(design: np.ndarray, param_names: tuple[str, ...]) -> list[di
 
     """
     norms, _, singular, right = _scaled_svd(np.asarray(design, float))
-    weak = right[_unseen(singular)]
+    weak = right[_negligible(singular)]
     return [] if len(weak) == 0 else _echelon(weak, norms, tuple(param_names))
 
 
@@ -121,7 +121,7 @@ def predicted_sd(design: np.ndarray, weights: np.ndarray | None = None, sigma: f
     if weights is not None:
         design = design * np.sqrt(np.asarray(weights, float))[:, None]
     norms, _, singular, right = _scaled_svd(design)
-    weak = _unseen(singular)
+    weak = _negligible(singular)
     reach = np.sqrt(np.sum((right[~weak].T / singular[~weak]) ** 2, axis=1)) / norms
     touched = np.any(np.abs(right[weak]) > 1e-7, axis=0)
     return np.where(touched, np.inf, sigma * reach)
@@ -192,8 +192,8 @@ def _scaled_svd(design):
     return norms, (orthogonal @ left)[:len(design)], singular, right
 
 
-def _unseen(singular):
-    """Return which of the descending singular values count as zero."""
+def _negligible(singular):
+    """Return a mask of the descending singular values that count as zero."""
     return singular <= RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)
 
 
@@ -207,7 +207,7 @@ def _ratio(singular):
 
 
 def _require_full_rank(design, norms, singular, right, names):
-    weak = _unseen(singular)
+    weak = _negligible(singular)
     if np.any(weak):
         directions = _echelon(right[weak], norms, names)
         raise NotObservableError(

@@ -274,7 +274,7 @@ class Driver:
         over = np.maximum(self.limits.lower - position, position - self.limits.upper) - self.tolerance
         if np.max(over) > 0:
             joint = int(np.argmax(over))
-            return f'joint {self._told(joint, position)} is beyond its range: stopped; see the limits in the description of the joints'
+            return f'joint {self._place_of(joint, position)} is beyond its range: stopped; see the limits in the description of the joints'
         fast = np.where(np.isfinite(rate), np.abs(rate), 0.0) / self.limits.speed
         if np.max(fast) > OVERSPEED:
             joint = int(np.argmax(fast))
@@ -287,7 +287,7 @@ class Driver:
         watch = self._watch
         if watch.has_strayed:
             joint = watch.suspect()
-            return (f'joint {self._told(joint, self.position)} does not follow: the joints are '
+            return (f'joint {self._place_of(joint, self.position)} does not follow: the joints are '
                     f'{self._amount(joint, watch.deviation.max() * watch.tolerance[joint])} from their path: stopped; '
                     'see whether something holds it')
         if watch.has_stalled_for <= self.settings.stall_patience:
@@ -313,7 +313,7 @@ class Driver:
             return self.stop(f'the joints do not rest within {self.settings.settling_patience:g} s: stopped; find the cause of the motion')
         return False
 
-    def _told(self, joint, position):
+    def _place_of(self, joint, position):
         return f'{self.joint_names[joint]}, at {self._amount(joint, position[joint])},'
 
     def _amount(self, joint, value):

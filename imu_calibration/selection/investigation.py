@@ -142,7 +142,7 @@ class _Outcome:
 
 
 @dataclass(frozen=True, eq=False)
-class _Attempt:
+class _Trial:
     """One explanation of the lags with the outcome of its search."""
 
     number: int
@@ -152,7 +152,7 @@ class _Attempt:
 
     @property
     def rank(self):
-        """Numbers of its lags that are named and chosen, then the order of the attempts."""
+        """Numbers of its lags that are named and chosen, then the order of the trials."""
         named, chosen = (len(self.lags & {question.name for question in some}) for some in (self.outcome.named, self.outcome.chosen))
         return named, chosen, -self.number
 
@@ -162,7 +162,7 @@ class _Attempt:
         return self.rank[0] == len(self.lags)
 
     def finished(self, linearised_at):
-        """Return the attempt without the lags that are not named; its rank may only fall."""
+        """Return the trial without the lags that are not named; its rank may only fall."""
         return replace(self, outcome=_without_unnamed(self.outcome, linearised_at))
 
 
@@ -179,10 +179,10 @@ def _with_lags(explanations, linearised_at):
         chosen = there.search.run(chosen)
         settled, rivals = settle_rivals(there, chosen, linearised_at)
         outcome = _relinearised(linearised_at, settled, chosen if settled is there else _searched(settled, chosen))
-        attempt = _Attempt(number, selected.lags.keys(), outcome, [*of_lags, *rivals])
-        if attempt.helps and (attempt := attempt.finished(linearised_at)).helps:
-            return attempt.outcome, attempt.rivals
-        tried.append(attempt)
+        trial = _Trial(number, selected.lags.keys(), outcome, [*of_lags, *rivals])
+        if trial.helps and (trial := trial.finished(linearised_at)).helps:
+            return trial.outcome, trial.rivals
+        tried.append(trial)
         most, refused = max(len(selected.lags) - 1, 1), [*refused, selected]
         if not explanations.others(most, refused):
             break
@@ -190,12 +190,12 @@ def _with_lags(explanations, linearised_at):
     return best.outcome, best.rivals
 
 
-def _best_of(attempts, linearised_at):
-    """Return the attempt with the highest rank; only those that may have it are finished."""
+def _best_of(trials, linearised_at):
+    """Return the trial with the highest rank; only those that may have it are finished."""
     best = None
-    for attempt in sorted(attempts, key=lambda attempt: attempt.rank, reverse=True):
-        if best is None or attempt.rank > best.rank:
-            finished = attempt.finished(linearised_at)
+    for trial in sorted(trials, key=lambda trial: trial.rank, reverse=True):
+        if best is None or trial.rank > best.rank:
+            finished = trial.finished(linearised_at)
             best = finished if best is None or finished.rank > best.rank else best
     return best
 

@@ -139,7 +139,7 @@ def propose(blocks: RestBlocks, problem: LinearisedProblem, fits: BlockFits, *, 
     needed = MIN_SMOOTH_SHARE if any(choice.formula.smooth for choice in choices) else MIN_FORMULA_SHARE
     if not choices or share < needed:
         return None
-    return _told(blocks, problem, fits, plain, choices)
+    return _proposal_of(blocks, problem, fits, plain, choices)
 
 
 def _plausible(sensor, problem):
@@ -176,7 +176,7 @@ def _stable(fits, choices):
     return bool((apart**2).mean() < 9.0 or (apart**2).sum() < 0.1 * (strength**2).sum())
 
 
-def _told(blocks, problem, fits, plain, choices):
+def _proposal_of(blocks, problem, fits, plain, choices):
     terms = [entry for choice in choices for entry in _shapes(fits, choices, choice)][:MOST_TERMS]
     columns = np.concatenate([column for column, _, _ in terms], axis=1)
     after = fits.fit(columns)

@@ -130,7 +130,7 @@ def process_mapper(jobs: int, done: Callable = lambda item: None) -> Callable:
     def mapped(function, items):
         items = list(items)
         if min(jobs, len(items)) <= 1:
-            return [_told(function(item), done) for item in items]
+            return [_reported(function(item), done) for item in items]
         # Spawned, not forked: a fork of a process with threads can stop for ever.
         with ProcessPoolExecutor(min(jobs, len(items)), mp_context=multiprocessing.get_context('spawn')) as pool:
             return _in_order(pool, function, items, done)
@@ -157,7 +157,7 @@ def _until_sigterm(function, item):
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-def _told(result, done):
+def _reported(result, done):
     done(result)
     return result
 
