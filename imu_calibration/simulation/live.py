@@ -61,7 +61,7 @@ class LiveSimulation:
         self.start_ns, self.causes = start_ns, tuple(causes)
         self._rng = np.random.default_rng([seed, 3])
         self._n = {'imu': 0, 'joints': 0, 'temperature': 0}
-        self._noise = ImuNoise(options.noise, sample_rate=options.imu_rate, rng=self._rng)
+        self._noise = ImuNoise(options.noise, sample_rate=options.imu_rate, rng=self._rng, drawn=True)
 
     def take(self, until: float) -> SimulatedBlock:
         """Return the samples from the end of the last block to `until` (s, exclusive)."""

@@ -128,12 +128,15 @@ class ImuNoise:
         Hz; a density d gives every sample the standard deviation ``d sqrt(sample_rate)``, so that the integral over t seconds
         scatters by ``d sqrt(t)`` (random-walk convention).
     rng : numpy.random.Generator
+    drawn : bool
+        Whether the first biases are drawn now, not with the first samples.
 
     """
 
-    def __init__(self, model: SimulatedNoise, *, sample_rate: float, rng: np.random.Generator):
+    def __init__(self, model: SimulatedNoise, *, sample_rate: float, rng: np.random.Generator, drawn: bool = False):
         self._model, self._rate, self._rng = model, sample_rate, rng
-        self._force_bias = self._rate_bias = None
+        sizes = (model.accel_instability, model.gyro_instability)
+        self._force_bias, self._rate_bias = [rng.normal(0.0, size, 3) for size in sizes] if drawn else (None, None)
 
     def add(self, force_s: np.ndarray, rate_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return readings from outputs without noise, m/s^2 and rad/s, shape (n, 3), n at least 1."""
