@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from typing import Any
 
 from imu_calibration.calibration.coverage import all_determined
@@ -105,6 +106,7 @@ class CalibrationWorker(threading.Thread):
 
     def run(self) -> None:
         """Run the steps until `end`."""
+        import_module('scipy.optimize')  # 11 MB and 0.2 s, which the first fit of a bias process would need later
         try:
             while not self._ending:
                 self._wake.wait(MESSAGE_CHECK_SECONDS)
