@@ -38,7 +38,7 @@ def run(folder):
     verb('compensate', second, '--calibration', folder / 'calibration.yaml', '--output', folder / 'other_session_corrected')
     table, calibration = files.read_table(second / 'table.yaml'), files.read_calibration(folder / 'calibration.yaml')
     truth = session_truth(source_of(second, joint_names=table.joint_names)(), table)
-    show(before_and_after(truth, calibration))
+    show(before_and_after(*truth, calibration))
     lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
     print('not determined by this recording: ' + (', '.join(lacking) if lacking else 'none; every parameter is within its tolerance'))
     print(f'report: {(folder / "report.html").resolve()}')

@@ -6,8 +6,9 @@ import numpy as np
 
 from imu_calibration.compensation.compensate import FittedErrors
 from imu_calibration.compensation.stream import CompensationStream
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.strapdown import dead_reckoning_errors
-from imu_calibration.preprocessing.window_finder import SessionTruth
 
 
 @dataclass(frozen=True)
@@ -24,13 +25,12 @@ class ErrorFigures:
     """Median position error after dead reckoning, m."""
 
 
-def error_figures(truth: SessionTruth, force_s: np.ndarray, rate_s: np.ndarray, *, seconds: float = 50.0) -> ErrorFigures:
+def error_figures(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray, *, seconds: float = 50.0) -> ErrorFigures:
     """
     Return the ErrorFigures of a version of the samples.
 
     Noise averages out over one second, so that the figures show the effect of calibration.
     """
-    reference = truth.reference
     period = float(np.median(np.diff(reference.time)))
     length = max(int(round(1.0 / period)), 1)
     edges = np.searchsorted(reference.time, np.arange(reference.time[0], reference.time[-1] + 1e-9, seconds))
@@ -47,8 +47,9 @@ def _rms_of_means(error, length):
     return float(np.sqrt((means**2).mean()))
 
 
-def before_and_after(truth: SessionTruth, calibration: FittedErrors, seconds: float = 50.0) -> tuple[ErrorFigures, ErrorFigures]:
+def before_and_after(imu: ImuSamples, reference: Reference, calibration: FittedErrors, *,
+                     seconds: float = 50.0) -> tuple[ErrorFigures, ErrorFigures]:
     """Return ErrorFigures of the raw and of the compensated samples."""
-    corrected = CompensationStream(calibration).correct(truth.imu)
-    return (error_figures(truth, truth.imu.force_s, truth.imu.rate_s, seconds=seconds),
-            error_figures(truth, corrected.force, corrected.rate, seconds=seconds))
+    corrected = CompensationStream(calibration).correct(imu)
+    return (error_figures(reference, imu.force_s, imu.rate_s, seconds=seconds),
+            error_figures(reference, corrected.force, corrected.rate, seconds=seconds))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.samples import Columns, ImuSamples
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, calibrate_by_hand
@@ -29,7 +29,7 @@ MAX_GATHERED_NUMBERS = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
+class Windows(Columns):
     """
     Windows of one length over one stream.
 
@@ -56,10 +56,6 @@ class Windows:
     def touches(self, flags: np.ndarray) -> np.ndarray:
         """Return which windows contain a flagged sample, shape (n_windows,)."""
         return np.any(flags[self.index] & (self.weight > 0), axis=1)
-
-    def select(self, keep: np.ndarray) -> 'Windows':
-        """Return the windows at `keep`."""
-        return Windows(self.index[keep], self.weight[keep], self.weight_slope[keep])
 
 
 def make_windows(time: np.ndarray, centres: np.ndarray, length: float) -> Windows:

@@ -1,5 +1,6 @@
 """Arrays of samples from a bag or a topic, independent of messages and files."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,22 +25,28 @@ def stamps_of(time: np.ndarray, unit: float = 1.0) -> np.ndarray:
     return start + np.round((time - time[0]) * (unit * 1e9)).astype(np.int64)
 
 
-class _Columns:
-    """Slicing and joining for dataclasses whose array fields share their first axis."""
+class Columns:
+    """Slicing and joining for dataclasses whose array fields share their first axis; a field may hold further columns, or None."""
 
-    def __len__(self):
-        return len(self.stamp_ns)
+    def __len__(self) -> int:
+        return next(len(value) for value in vars(self).values() if isinstance(value, np.ndarray))
 
-    def select(self, index):
-        """Return the samples at `index` (slice, mask or integer array)."""
-        return type(self)(**{name: value[index] if isinstance(value, np.ndarray) else value for name, value in vars(self).items()})
+    def select(self, index: Any) -> Any:
+        """Return the rows at `index` (slice, mask or integer array)."""
+        return type(self)(**{name: value[index] if isinstance(value, np.ndarray) else
+                             value.select(index) if isinstance(value, Columns) else value for name, value in vars(self).items()})
 
     @classmethod
-    def concatenate(cls, parts):
-        """Join `parts` in order; fields that are not arrays are those of the first part."""
+    def concatenate(cls, parts: Iterable[Any]) -> Any:
+        """Join `parts` in order; a field that one of them lacks is None, and fields that are not arrays are those of the first part."""
         parts = list(parts)
-        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) if isinstance(value, np.ndarray) else value
-                      for name, value in vars(parts[0]).items()})
+        return cls(**{name: _joined([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+
+
+def _joined(values):
+    if any(value is None for value in values):
+        return None
+    return np.concatenate(values) if isinstance(values[0], np.ndarray) else values[0]
 
 
 class JoinedParts:
@@ -56,7 +63,7 @@ class JoinedParts:
     def __len__(self) -> int:
         return self._count
 
-    def add(self, part: _Columns) -> None:
+    def add(self, part: Columns) -> None:
         """Append samples of one kind."""
         if self._first is None:
             self._first = part.select(slice(0))
@@ -79,7 +86,7 @@ class JoinedParts:
 
 
 @dataclass(frozen=True, eq=False)
-class ImuSamples(_Columns):
+class ImuSamples(Columns):
     """Readings of one IMU in the order of arrival."""
 
     stamp_ns: np.ndarray
@@ -95,7 +102,7 @@ class ImuSamples(_Columns):
 
 
 @dataclass(frozen=True, eq=False)
-class JointSamples(_Columns):
+class JointSamples(Columns):
     """Joint states brought to one order of names."""
 
     stamp_ns: np.ndarray
@@ -115,7 +122,7 @@ class JointSamples(_Columns):
 
 
 @dataclass(frozen=True, eq=False)
-class TemperatureSamples(_Columns):
+class TemperatureSamples(Columns):
     """Temperature near the sensor."""
 
     stamp_ns: np.ndarray

@@ -180,7 +180,7 @@ def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | 
     temperatures = np.concatenate(known) if len(known) == len(windows) else None
     if len(windows) == 1:
         return windows[0].motion, temperatures
-    return JointMotion.joined([window.motion for window in windows]), temperatures
+    return JointMotion.concatenate(window.motion for window in windows), temperatures
 
 
 def _reduced(window, designs, session, inputs):

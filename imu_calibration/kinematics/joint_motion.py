@@ -1,15 +1,15 @@
 """The joints' motion at given instants (angles and three derivatives), errors of angle encoders, and the motion at shifted times."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from math import factorial
-from typing import Any
 
 import numpy as np
 
+from imu_calibration.core.samples import Columns
+
 
 @dataclass(frozen=True, eq=False)
-class JointMotion:
+class JointMotion(Columns):
     """Angles of the joints and their first three derivatives; columns in the order of the table's joints."""
 
     time: np.ndarray
@@ -26,23 +26,6 @@ class JointMotion:
     """Thermal branch at these instants (`kinematics.signal_history`), shape (n,); None: unknown."""
     vibration: np.ndarray | None = None
     """Variance of vibration (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3); None: unknown."""
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def select(self, index: np.ndarray | slice) -> 'JointMotion':
-        """Return the motion at `index` (slice, mask or integer array)."""
-        known = {f.name: getattr(self, f.name) for f in fields(self)}
-        selected: dict[str, Any] = {name: None if values is None else values[index] for name, values in known.items()}
-        return JointMotion(**selected)
-
-    @classmethod
-    def joined(cls, parts: Sequence['JointMotion']) -> 'JointMotion':
-        """Return consecutive motions; a quantity that one of them lacks is unknown."""
-        columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(cls)}
-        joined: dict[str, Any] = {name: None if any(each is None for each in some) else np.concatenate(some)
-                                  for name, some in columns.items()}
-        return cls(**joined)
 
 
 def with_encoder_harmonics(motion: JointMotion, order: int, cos_amplitude: np.ndarray, *, sin_amplitude: np.ndarray) -> JointMotion:

@@ -1,17 +1,18 @@
 """Readings of a perfect sensor, rotation matrices from vectors and angles, normal gravity and the rate of the Earth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import Columns
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class Reference(Columns):
     """Motion of the mount's reference point at the IMU's stamps."""
 
     time: np.ndarray
@@ -34,9 +35,6 @@ class Reference:
     """Variance of vibration at the samples (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3); None: unknown."""
     motion: Any = None
     """The joints' motion (`JointMotion`), when there is a table."""
-
-    def __len__(self) -> int:
-        return len(self.time)
 
     @property
     def thermal_branch(self) -> np.ndarray:
@@ -63,13 +61,6 @@ class Reference:
         if self.motion is None:
             raise InputError('an effect that depends on joints needs a table or an arm, there is none; omit the effect')
         return self.motion
-
-    def select(self, index: np.ndarray | slice) -> 'Reference':
-        """Return the reference at `index` (slice, mask or integer array)."""
-        changed = {f.name: getattr(self, f.name)[index] for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
-        if self.motion is not None:
-            changed['motion'] = self.motion.select(index)
-        return replace(self, **changed)
 
 
 def skew(vector: Sequence[float] | np.ndarray) -> np.ndarray:

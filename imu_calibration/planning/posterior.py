@@ -176,7 +176,7 @@ class WindowPredictor:
         return [[next(windows) for _ in one] for one in cuts]
 
     def _windows(self, cuts, wander):
-        motion = JointMotion.joined([cut[0] for cut in cuts])
+        motion = JointMotion.concatenate(cut[0] for cut in cuts)
         edges = np.cumsum([0] + [len(cut[0]) for cut in cuts])
         model = self.coordinates.folded
         temperature = np.full(len(motion), model.temperature_ref_c) if model.needs_temperature else None

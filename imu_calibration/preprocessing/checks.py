@@ -102,8 +102,7 @@ RATE_SHARE = 0.02
 def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every sample has a stamp of its own, later than the one before, and finite readings."""
     clean = []
-    for name, stream in evidence.streams.items():
-        found = stream.statistics
+    for name, found in evidence.streams.items():
         # Spikes are samples with accepted stamps, and a clock reset drops no sample.
         total = found.count + sum(count for reason, count in found.dropped.items() if reason not in ('clock reset', 'spike'))
         if found.count < 0.1 * total:
@@ -126,14 +125,13 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 
 def _fast_streams(evidence):
-    """Return (message type, Stream) of the IMU and the joints."""
+    """Return (message type, StreamStatistics) of the IMU and the joints."""
     return [(MESSAGES[name], evidence.streams[name]) for name in ('imu', 'joints') if name in evidence.streams]
 
 
 def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The streams have no gaps."""
-    for name, stream in _fast_streams(evidence):
-        found = stream.statistics
+    for name, found in _fast_streams(evidence):
         if found.n_gaps:
             severity = WARNING if found.gap_total > GAP_SHARE * found.duration else NOTE
             yield CheckFinding('gaps', severity, f'{name}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s '
@@ -142,8 +140,8 @@ def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The samples per second agree with the step between stamps."""
-    for name, stream in _fast_streams(evidence):
-        nominal, real = stream.statistics.rate, stream.real_rate
+    for name, found in _fast_streams(evidence):
+        nominal, real = found.rate, found.real_rate
         if nominal and abs(real / nominal - 1) > RATE_SHARE:
             yield CheckFinding('sampling', WARNING, f'{name}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is '
                                f'{real:.2f} Hz: samples were lost, or stamps are made when messages arrive; check the driver and the '
@@ -154,15 +152,15 @@ def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 def jitter(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Samples are evenly spaced, and stamps finer than their spacing."""
-    for name, stream in _fast_streams(evidence):
-        found, faults = stream.statistics, []
+    for name, found in _fast_streams(evidence):
+        faults = []
         if found.stamping is not None:
             yield CheckFinding('jitter', WARNING if found.stamping.word == IRREGULAR else NOTE,
                                f"{name}: {found.stamping}; stamps by the sensor's own clock would be better")
         if found.stamp_step_ns and found.stamp_step_ns % WHOLE_MS == 0 and found.stamp_step_ns < 0.5e9 * found.period:
             faults.append(f'all stamps are multiples of {found.stamp_step_ns // WHOLE_MS} ms')
-        if stream.irregular > MAX_IRREGULAR_SHARE:
-            faults.append(f'{100 * stream.irregular:.0f} % of the steps are off the usual {found.period * 1e3:.4g} ms by more than a tenth')
+        if found.irregular > MAX_IRREGULAR_SHARE:
+            faults.append(f'{100 * found.irregular:.0f} % of the steps are off the usual {found.period * 1e3:.4g} ms by more than a tenth')
         if faults:
             yield CheckFinding('jitter', NOTE, f"{name}: {', '.join(faults)}; stamps by the sensor's own clock would be better")
 
@@ -172,10 +170,10 @@ def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     if not {'imu', 'joints'} <= evidence.streams.keys():
         return
     imu, joints = evidence.streams['imu'], evidence.streams['joints']
-    if any('clock reset' in stream.statistics.dropped for stream in (imu, joints)):
+    if any('clock reset' in stream.dropped for stream in (imu, joints)):
         return
     overlap = (min(imu.last_ns, joints.last_ns) - max(imu.first_ns, joints.first_ns)) * 1e-9
-    shorter = min(imu.statistics.duration, joints.statistics.duration)
+    shorter = min(imu.duration, joints.duration)
     late = (joints.first_ns - imu.first_ns) * 1e-9
     if overlap <= 0 and shorter > 0:
         yield CheckFinding('clocks', REFUSE, f'Imu and JointState must be stamped by one clock, the joints begin {abs(late):.6g} s '

@@ -10,6 +10,7 @@ from imu_calibration.core.samples import runs_of, smallest_step
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.rotations import rpy_from_rotation
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import refuse, span_words
 from imu_calibration.preprocessing.on_table import MIN_MATCH, TESTED_RATE, exchanged, find_exchange, match_axes, same_motion, signs_or_delay
@@ -248,11 +249,7 @@ def _cause(match, matrix, seen, table):
 def _mount_rpy_deg(matrix, table):
     """Return roll, pitch, yaw of the rotation nearest to the measured matrix, in the convention of `mount.rpy_deg`."""
     left, _, right = np.linalg.svd(matrix)
-    mat_ls = (left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right @ table.mat_sl).T
-    pitch = np.arctan2(-mat_ls[2, 0], np.hypot(mat_ls[2, 1], mat_ls[2, 2]))
-    if np.cos(pitch) < 1e-3:
-        return np.degrees([0.0, pitch, np.arctan2(-mat_ls[0, 1], mat_ls[1, 1])]) + 0.0
-    return np.degrees([np.arctan2(mat_ls[2, 1], mat_ls[2, 2]), pitch, np.arctan2(mat_ls[1, 0], mat_ls[0, 0])]) + 0.0
+    return np.degrees(rpy_from_rotation((left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right @ table.mat_sl).T))
 
 
 def check_units(gathered: Reduced, model: SensorModel, table: Table | None = None) -> None:

@@ -127,7 +127,7 @@ def find_exchange(windows: Sequence[Window], table: Table) -> Exchange | None:
         return None
     time = np.concatenate([window.time for window in windows])
     every = slice(None, None, max(1, len(time) // MAX_TESTED_SAMPLES))
-    time, motion = time[every], JointMotion.joined([window.motion for window in windows]).select(every)
+    time, motion = time[every], JointMotion.concatenate(window.motion for window in windows).select(every)
     measured = np.concatenate([np.hstack([window.rate_s, window.force_s]) for window in windows])[every]
     rate = measured[:, :3] = measured[:, :3] - np.median(measured[:, :3], axis=0)
     squares = np.stack([((rate - reference_motion(table, motion).rate_s)**2).sum(axis=1), (rate**2).sum(axis=1), np.ones(len(time))])

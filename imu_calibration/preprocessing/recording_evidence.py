@@ -21,41 +21,18 @@ from imu_calibration.preprocessing.scan import (
     frozen_joints,
     frozen_parts,
 )
-from imu_calibration.preprocessing.stream_cleaning import STREAMS, CleanedBlock, StreamStatistics
+from imu_calibration.preprocessing.stream_cleaning import CleanedBlock, StreamStatistics
 
-MAX_STEP_DEVIATION = 0.1
-"""Steps farther than this share from the usual one count as irregular."""
 RESOLUTION_SAMPLES = 20_000
 """First samples, from which the smallest step between readings is estimated."""
-
-
-@dataclass(frozen=True, eq=False)
-class Stream:
-    """One stream of stamps."""
-
-    statistics: StreamStatistics
-    """Rates, gaps, drops."""
-    first_ns: int
-    """Smallest stamp."""
-    last_ns: int
-    """Largest stamp."""
-    irregular: float
-    """Share of the steps that are off the usual one by more than a tenth."""
-
-    @property
-    def real_rate(self) -> float:
-        """Samples per second, gaps excluded; 0 when unknown."""
-        s = self.statistics
-        time = s.duration - s.gap_total + s.n_gaps * s.period
-        return (s.count - 1) / time if s.count > 1 and time > 0 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class RecordingEvidence:
     """A recording as the checks see it, cleaned and in SI."""
 
-    streams: dict
-    """'imu', 'joints', 'temperature' -> Stream; only streams with messages."""
+    streams: dict[str, StreamStatistics]
+    """'imu', 'joints', 'temperature' -> rates, gaps, drops; only streams with accepted samples."""
     chunks: Chunks
     """Readings of the IMU in short chunks."""
     n_samples: int
@@ -126,16 +103,12 @@ class EvidenceGatherer:
 
     def __init__(self, gravity: float):
         self.gravity = gravity
-        self._steps = {name: _Steps() for name in STREAMS}
         self._chunks, self._ends = ChunkSeries(), tuple((Extremes(), Extremes()) for _ in range(6))
         self._resolution, self._joints = np.full(6, np.inf), StandingJoints()
         self._temperature_c: tuple[float, float] | None = None
 
     def push(self, cleaned: CleanedBlock) -> None:
         """Process a CleanedBlock."""
-        for name in STREAMS:
-            for epoch, samples in getattr(cleaned, name):
-                self._steps[name].push(samples.stamp_ns, epoch)
         for _, imu in cleaned.imu:
             self._take_imu(imu)
         for _, joints in cleaned.joints:
@@ -146,7 +119,7 @@ class EvidenceGatherer:
 
     def evidence(self, statistics: dict[str, StreamStatistics]) -> RecordingEvidence:
         """Return the RecordingEvidence, with the StreamStatistics of each stream."""
-        streams = {name: Stream(statistics[name], *steps.summary()) for name, steps in self._steps.items() if steps.first_ns is not None}
+        streams = {name: found for name, found in statistics.items() if found.count}
         resolution = np.where(np.isfinite(self._resolution), self._resolution, 0.0)
         chunks, series = self._chunks.chunks(), self._chunks
         return RecordingEvidence(streams, chunks, series.n_samples, series.n_changed, series.n_repeated, resolution, self._ends,
@@ -160,34 +133,6 @@ class EvidenceGatherer:
         for column, (upwards, downwards) in zip(columns, self._ends):
             upwards.push(column)
             downwards.push(-column)
-
-
-class _Steps:
-    """First and last stamp, and the share of irregular steps."""
-
-    def __init__(self):
-        self.first_ns = self.last_ns = self._period_ns = self._previous_ns = None
-        self._epoch, self._n_steps, self._n_irregular = 0, 0, 0
-
-    def push(self, stamp_ns, epoch):
-        """Process accepted stamps of one epoch."""
-        if self.first_ns is None:
-            self.first_ns, self.last_ns = int(stamp_ns[0]), int(stamp_ns[0])
-        self.first_ns, self.last_ns = min(self.first_ns, int(stamp_ns[0])), max(self.last_ns, int(stamp_ns[-1]))
-        step = np.diff(stamp_ns)
-        if self._previous_ns is not None and epoch == self._epoch:
-            step = np.append(stamp_ns[0] - self._previous_ns, step)
-        self._previous_ns, self._epoch = stamp_ns[-1], epoch
-        if not len(step):
-            return
-        if self._period_ns is None:
-            self._period_ns = float(np.median(step[:2000]))
-        self._n_steps += len(step)
-        self._n_irregular += int(np.count_nonzero(np.abs(step - self._period_ns) > MAX_STEP_DEVIATION * self._period_ns))
-
-    def summary(self):
-        """Return (first stamp, last stamp, share of irregular steps)."""
-        return self.first_ns, self.last_ns, self._n_irregular / max(self._n_steps, 1)
 
 
 class Severity(StrEnum):

@@ -1,10 +1,10 @@
 """One pass over a recording in chunks: rest, and parts with frozen output."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.core.samples import runs_of
+from imu_calibration.core.samples import Columns, runs_of
 
 CHUNK_SECONDS = 0.25
 """s; short against turns by hand, long against the period of the samples; also the distance at which temperatures are kept."""
@@ -17,7 +17,7 @@ MAX_SCAN_CHUNKS = 40_000
 
 
 @dataclass(frozen=True, eq=False)
-class Chunks:
+class Chunks(Columns):
     """Chunks in order of time; columns are force x, y, z, then rate x, y, z."""
 
     time: np.ndarray
@@ -34,13 +34,6 @@ class Chunks:
     """Samples per chunk."""
     first_ns: int = 0
     """Stamp of the first sample, where `time` is zero."""
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def select(self, keep: np.ndarray) -> 'Chunks':
-        """Return the chunks at a mask."""
-        return replace(self, **{name: getattr(self, name)[keep] for name in ('time', 'duration', 'mean', 'sd', 'range')})
 
 
 class ChunkSeries:

@@ -17,6 +17,7 @@ BACKWARD_RESET_NS = _SECOND
 """A larger backward step is a reset of the clock, a smaller one a late sample."""
 FORWARD_RESET_NS = 3600 * _SECOND
 """A larger forward step is a reset of the clock as well (a computer that receives the date after start-up)."""
+NEVER_NS = 1 << 62
 _NEEDED = {ImuSamples: ('force_s', 'rate_s'), JointSamples: ('position',), TemperatureSamples: ('temperature_c',)}
 
 
@@ -37,6 +38,7 @@ class StreamCheck:
         self._steps = StepHistogram()
         self._n_accepted = 0
         self._span_ns = 0
+        self._extent_ns = NEVER_NS, -NEVER_NS
         self._newest = None
         self._before_held = None
         self._held = None
@@ -70,9 +72,7 @@ class StreamCheck:
             Steps longer than this, and than five median periods, are counted as gaps, s.
 
         """
-        period = self._steps.median()
-        return StreamStatistics(self._n_accepted, dict(self.counts), self._span_ns / 1e9, period, self._steps.common_step_ns,
-                                *self._steps.longer_than(max(gap, 5 * period)),
+        return StreamStatistics(self._n_accepted, dict(self.counts), self._span_ns / 1e9, *self._steps.summary(gap), *self._extent_ns,
                                 None if self._times is None else self._times.odd_line(self._n_accepted))
 
     def _without_spikes(self, accepted, ended=False):
@@ -175,6 +175,7 @@ class StreamCheck:
             joined = samples.stamp_ns if self._newest is None else np.concatenate([[self._newest], samples.stamp_ns])
             self._steps.add(np.diff(joined))
             self._span_ns += int(joined[-1] - joined[0])
+            self._extent_ns = min(self._extent_ns[0], int(samples.stamp_ns[0])), max(self._extent_ns[1], int(samples.stamp_ns[-1]))
             self._newest = joined[-1]
             self._n_accepted += len(samples)
         return [(self.epoch, samples)]
@@ -204,6 +205,12 @@ class StreamStatistics:
     """Their total length, s."""
     longest_step: float
     """Longest step between stamps, a gap or not, s."""
+    irregular: float
+    """Share of the steps that are off the median by more than a tenth."""
+    first_ns: int
+    """Smallest stamp; larger than `last_ns` without samples."""
+    last_ns: int
+    """Largest stamp."""
     stamping: StampLine | None = None
     """Regularity of the stamps of an IMU; None if they are regular, and for other streams."""
     unstamped: int = 0
@@ -214,6 +221,12 @@ class StreamStatistics:
         """Samples per second between gaps, 0 when unknown."""
         return 1.0 / self.period if self.period > 0 else 0.0
 
+    @property
+    def real_rate(self) -> float:
+        """Samples per second, gaps excluded; 0 when unknown."""
+        time = self.duration - self.gap_total + self.n_gaps * self.period
+        return (self.count - 1) / time if self.count > 1 and time > 0 else 0.0
+
 
 _BINS_PER_E = 100
 
@@ -223,6 +236,8 @@ _N_BINS = 4500
 
 
 _FINE_STEP_NS = 100
+MAX_STEP_DEVIATION = 0.1
+"""Steps farther than this share from the median count as irregular."""
 
 
 class StepHistogram:
@@ -245,19 +260,18 @@ class StepHistogram:
         if self.common_step_ns == 0 or self.common_step_ns > _FINE_STEP_NS:
             self.common_step_ns = int(np.gcd(self.common_step_ns, np.gcd.reduce(step_ns)))
 
-    def median(self) -> float:
-        """Return the median step to one per cent (exact when the steps are equal), s; 0 without steps."""
-        total = self._number.sum()
-        if total == 0:
-            return 0.0
-        middle = np.searchsorted(np.cumsum(self._number), (total + 1) // 2)
-        return float(self._sum_ns[middle] / self._number[middle] / 1e9)
+    def summary(self, gap: float) -> tuple[float, int, int, float, float, float]:
+        """
+        Return the fields of `StreamStatistics` from `period` to `irregular`.
 
-    def longer_than(self, gap: float) -> tuple[int, float, float]:
-        """Return number and total (s) of the steps longer than `gap` s, bin by bin, and the longest step (s)."""
-        filled = np.maximum(self._number, 1)
-        longer = self._sum_ns / filled > gap * 1e9
-        return int(self._number[longer].sum()), float(self._sum_ns[longer].sum() / 1e9), self._longest_ns / 1e9
+        The median is exact to one per cent, and exactly when the steps are equal; all steps of a bin count alike.
+        """
+        mean, total = self._sum_ns / np.maximum(self._number, 1), int(self._number.sum())
+        median = mean[np.searchsorted(np.cumsum(self._number), (total + 1) // 2)]
+        longer = mean > max(gap * 1e9, 5 * median)
+        irregular = self._number[np.abs(mean - median) > MAX_STEP_DEVIATION * median].sum() / max(total, 1)
+        return (float(median / 1e9), self.common_step_ns, int(self._number[longer].sum()), float(self._sum_ns[longer].sum() / 1e9),
+                self._longest_ns / 1e9, float(irregular))
 
 
 STREAMS = ('imu', 'joints', 'temperature')

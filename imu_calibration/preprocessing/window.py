@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.core.samples import _Columns
+from imu_calibration.core.samples import Columns
 from imu_calibration.core.settings import setting
 from imu_calibration.kinematics.joint_motion import JointMotion
 
@@ -80,7 +80,7 @@ class Window:
 
 
 @dataclass(frozen=True, eq=False)
-class PhasedSamples(_Columns):
+class PhasedSamples(Columns):
     """IMU samples with the motion of the joints."""
 
     stamp_ns: np.ndarray
@@ -176,7 +176,7 @@ def chunks(windows: Iterable[Window]) -> Iterator[list[Window]]:
 
 def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None, np.ndarray]:
     """Return the motion of all windows, their temperatures or None, and for each sample the row of the motion that belongs to it."""
-    motion = JointMotion.joined([window.motion for window in windows])
+    motion = JointMotion.concatenate(window.motion for window in windows)
     lengths = [len(w.motion) for w in windows]
     starts = np.cumsum([0] + lengths)
     rows = np.concatenate([np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.rest_detection import QuietFloor
 from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT, MotionChunks
 from imu_calibration.preprocessing.stream_cleaning import STREAMS, BlockCleaner, Watcher
-from imu_calibration.preprocessing.window import UnusedReason, Window, WindowKind, WindowSettings
+from imu_calibration.preprocessing.window import UnusedReason, Window, WindowKind, WindowSettings, all_samples
 from imu_calibration.preprocessing.window_cutter import WindowCutter
 
 
@@ -194,30 +194,10 @@ def _span(queue):
     return abs(int(last) - int(first)) / 1e9
 
 
-@dataclass(frozen=True, eq=False)
-class SessionTruth:
-    """Measured samples with their reference from the table."""
-
-    imu: ImuSamples
-    """Samples with a reference."""
-    reference: Reference
-    """True motion at their stamps."""
-
-
-def session_truth(blocks: Iterable[SampleBlock], table: Table) -> SessionTruth:
-    """Return the samples of a session with their reference, where joints and IMU are both present."""
+def session_truth(blocks: Iterable[SampleBlock], table: Table) -> tuple[ImuSamples, Reference]:
+    """Return the samples of a session with their reference from the table, where joints and IMU are both present."""
     windows = MotionGatherer(table, WindowSettings(), keep_unused=True).all_of(blocks)
-    references = [_reference(window, table) for window in windows]
-    stamp_ns, force_s, rate_s = (np.concatenate([getattr(w, name) for w in windows]) for name in ('stamp_ns', 'force_s', 'rate_s'))
-    names = ('time', 'mat_sn', 'force_s', 'rate_s', 'alpha_s')
-    joined = {name: np.concatenate([getattr(r, name) for r in references]) for name in names}
-    return SessionTruth(ImuSamples(stamp_ns, force_s, rate_s), Reference(**joined, gravity=table.gravity_value))
-
-
-def _reference(window, table):
-    """Return the reference at every sample; the motion of a static window is one row for all samples."""
-    motion = window.motion
-    if len(motion) != len(window.time):
-        motion = motion.select(np.zeros(len(window.time), int))
-    reference = reference_motion(table, motion)
-    return Reference(window.time, reference.mat_sn, reference.force_s, reference.rate_s, reference.alpha_s, reference.gravity)
+    motion, _, rows = all_samples(windows)
+    stamp_ns, force_s, rate_s, time = (np.concatenate([getattr(window, name) for window in windows])
+                                       for name in ('stamp_ns', 'force_s', 'rate_s', 'time'))
+    return ImuSamples(stamp_ns, force_s, rate_s), replace(reference_motion(table, motion).select(rows), time=time)

@@ -125,7 +125,7 @@ def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProb
     which = _some(windows, length)
     windows = [windows[k] for k in which]
     starts_of, rows_of, per_block = zip(*(_cut(window, length) for window in windows))
-    motion = JointMotion.joined([window.motion.select(rows) for window, rows in zip(windows, rows_of)])
+    motion = JointMotion.concatenate(window.motion.select(rows) for window, rows in zip(windows, rows_of))
     warm = [w.temperature_c[rows] if len(rows) > 1 else w.temperature_c.mean(keepdims=True) for w, rows in zip(windows, rows_of)
             if w.temperature_c is not None]
     temperature = np.concatenate(warm) if len(warm) == len(windows) else None

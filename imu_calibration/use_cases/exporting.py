@@ -63,10 +63,10 @@ def _motion(calibration, bag, stand, topics) -> TrialMotion:
         blocks = [block.imu for block in source_of(bag, topics)() if block.imu is not None]
         return recorded_motion(calibration, ImuSamples.concatenate(blocks), temperature, name=name_of(bag))
     table = table_of(stand, [bag], topics)
-    truth = session_truth(source_of(bag, topics, table.joint_names)(), table)
-    ref, warmth = truth.reference, temperature_at(calibration, temperature, truth.imu.stamp_ns)
+    imu, ref = session_truth(source_of(bag, topics, table.joint_names)(), table)
+    warmth = temperature_at(calibration, temperature, imu.stamp_ns)
     return motion_of(ref.force_s, ref.rate_s, ref.alpha_s, temperature_c=warmth,
-                     text=f'{name_of(bag)}, moved as its table says ({len(truth.imu)} samples)')
+                     text=f'{name_of(bag)}, moved as its table says ({len(imu)} samples)')
 
 
 def import_calibration(path: str | PathLike, source: str, *, output: str | PathLike | None = None, frame_id: str = '') -> Calibration:

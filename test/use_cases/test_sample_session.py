@@ -68,12 +68,12 @@ def test_compensated_bag(output, tmp_path):
     with open_recording(corrected, imu_topic='/imu/data_corrected') as recording:
         assert {topic.name for topic in recording.topics} == {'/imu/data_raw', '/imu/data_corrected', '/joint_states'}
         table = Table.from_mapping(documents.from_text((BAG / 'table.yaml').read_text()))
-        truth = session_truth(recording.blocks(table.joint_names), table)
-    still = np.linalg.norm(truth.reference.rate_s, axis=1) < 1e-3
-    error = truth.imu.force_s[still].reshape(-1, 3) - truth.reference.force_s[still]
+        imu, reference = session_truth(recording.blocks(table.joint_names), table)
+    still = np.linalg.norm(reference.rate_s, axis=1) < 1e-3
+    error = imu.force_s[still].reshape(-1, 3) - reference.force_s[still]
     assert np.abs(error.mean(axis=0)).max() < 2e-3
     with open_recording(BAG) as recording:
         raw = session_truth(recording.blocks(table.joint_names), table)
-    before, after = before_and_after(raw, load(output / 'calibration.yaml'))
+    before, after = before_and_after(*raw, load(output / 'calibration.yaml'))
     print(f'sample session: {before.force} -> {after.force} m/s^2, {before.rate} -> {after.rate} rad/s')
     assert after.force < 0.1 * before.force and after.rate < 0.1 * before.rate

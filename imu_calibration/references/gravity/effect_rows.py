@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from imu_calibration.core.samples import Columns
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.estimation.noise_search import NATURAL
@@ -17,7 +18,7 @@ from imu_calibration.references.gravity.hand_parameters import HandModel
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class Block(Columns):
     """Rows of one kind, ``residual = columns @ parameters + error``, in the unit of their sensor."""
 
     name: str
@@ -36,11 +37,6 @@ class Block:
     """Seconds since the first sample, shape (m,)."""
     duration: np.ndarray | None = None
     """Of each turn, s, shape (m,): residuals of turns times it are angles; None for poses."""
-
-    def select(self, keep: np.ndarray) -> 'Block':
-        """Return the rows at a mask."""
-        return replace(self, **{name: getattr(self, name)[keep] for name in ('rows', 'known', 'floor', 'pose', 'time', 'duration')
-                                if getattr(self, name) is not None})
 
 
 @dataclass(frozen=True, eq=False)

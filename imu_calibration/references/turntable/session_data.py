@@ -82,7 +82,7 @@ def _again(entry, model, table):
 
 def owned_window(window: Window) -> Window:
     """Return a copy of the window in separate memory: slices would keep the complete chunk in memory."""
-    motion = JointMotion.joined([window.motion])
+    motion = JointMotion.concatenate([window.motion])
     temperature = None if window.temperature_c is None else np.array(window.temperature_c)
     return Window(window.kind, window.stamp_ns.copy(), window.time.copy(), window.force_s.copy(), window.rate_s.copy(), motion, temperature,
                   joint_step=window.joint_step)
