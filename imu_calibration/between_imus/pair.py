@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.core.samples import Columns, ImuSamples
+from imu_calibration.core.samples import AlignedArrays, ImuSamples
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, calibrate_by_hand
@@ -29,7 +29,7 @@ MAX_GATHERED_NUMBERS = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Windows(Columns):
+class Windows(AlignedArrays):
     """
     Windows of one length over one stream.
 

@@ -25,8 +25,8 @@ def stamps_of(time: np.ndarray, unit: float = 1.0) -> np.ndarray:
     return start + np.round((time - time[0]) * (unit * 1e9)).astype(np.int64)
 
 
-class Columns:
-    """Slicing and joining for dataclasses whose array fields share their first axis; a field may hold further columns, or None."""
+class AlignedArrays:
+    """Slicing and joining for dataclasses whose array fields share their first axis; a field may hold another such object, or None."""
 
     def __len__(self) -> int:
         return next(len(value) for value in vars(self).values() if isinstance(value, np.ndarray))
@@ -34,7 +34,7 @@ class Columns:
     def select(self, index: Any) -> Any:
         """Return the rows at `index` (slice, mask or integer array)."""
         return type(self)(**{name: value[index] if isinstance(value, np.ndarray) else
-                             value.select(index) if isinstance(value, Columns) else value for name, value in vars(self).items()})
+                             value.select(index) if isinstance(value, AlignedArrays) else value for name, value in vars(self).items()})
 
     @classmethod
     def concatenate(cls, parts: Iterable[Any]) -> Any:
@@ -63,7 +63,7 @@ class JoinedParts:
     def __len__(self) -> int:
         return self._count
 
-    def add(self, part: Columns) -> None:
+    def add(self, part: AlignedArrays) -> None:
         """Append samples of one kind."""
         if self._first is None:
             self._first = part.select(slice(0))
@@ -86,7 +86,7 @@ class JoinedParts:
 
 
 @dataclass(frozen=True, eq=False)
-class ImuSamples(Columns):
+class ImuSamples(AlignedArrays):
     """Readings of one IMU in the order of arrival."""
 
     stamp_ns: np.ndarray
@@ -102,7 +102,7 @@ class ImuSamples(Columns):
 
 
 @dataclass(frozen=True, eq=False)
-class JointSamples(Columns):
+class JointSamples(AlignedArrays):
     """Joint states brought to one order of names."""
 
     stamp_ns: np.ndarray
@@ -122,7 +122,7 @@ class JointSamples(Columns):
 
 
 @dataclass(frozen=True, eq=False)
-class TemperatureSamples(Columns):
+class TemperatureSamples(AlignedArrays):
     """Temperature near the sensor."""
 
     stamp_ns: np.ndarray

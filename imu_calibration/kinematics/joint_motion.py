@@ -5,11 +5,11 @@ from math import factorial
 
 import numpy as np
 
-from imu_calibration.core.samples import Columns
+from imu_calibration.core.samples import AlignedArrays
 
 
 @dataclass(frozen=True, eq=False)
-class JointMotion(Columns):
+class JointMotion(AlignedArrays):
     """Angles of the joints and their first three derivatives; columns in the order of the table's joints."""
 
     time: np.ndarray

@@ -8,11 +8,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import Columns
+from imu_calibration.core.samples import AlignedArrays
 
 
 @dataclass(frozen=True, eq=False)
-class Reference(Columns):
+class Reference(AlignedArrays):
     """Motion of the mount's reference point at the IMU's stamps."""
 
     time: np.ndarray

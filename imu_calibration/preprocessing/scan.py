@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.core.samples import Columns, runs_of
+from imu_calibration.core.samples import AlignedArrays, runs_of
 
 CHUNK_SECONDS = 0.25
 """s; short against turns by hand, long against the period of the samples; also the distance at which temperatures are kept."""
@@ -17,7 +17,7 @@ MAX_SCAN_CHUNKS = 40_000
 
 
 @dataclass(frozen=True, eq=False)
-class Chunks(Columns):
+class Chunks(AlignedArrays):
     """Chunks in order of time; columns are force x, y, z, then rate x, y, z."""
 
     time: np.ndarray

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.core.samples import Columns
+from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.core.settings import setting
 from imu_calibration.kinematics.joint_motion import JointMotion
 
@@ -80,7 +80,7 @@ class Window:
 
 
 @dataclass(frozen=True, eq=False)
-class PhasedSamples(Columns):
+class PhasedSamples(AlignedArrays):
     """IMU samples with the motion of the joints."""
 
     stamp_ns: np.ndarray

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.core.samples import Columns
+from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.estimation.noise_search import NATURAL
@@ -18,7 +18,7 @@ from imu_calibration.references.gravity.hand_parameters import HandModel
 
 
 @dataclass(frozen=True, eq=False)
-class Block(Columns):
+class Block(AlignedArrays):
     """Rows of one kind, ``residual = columns @ parameters + error``, in the unit of their sensor."""
 
     name: str
