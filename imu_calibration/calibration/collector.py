@@ -3,15 +3,15 @@
 import copy
 import io
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.from_solution import ModelExtension
+from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
 from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.samples import NominalScaling, SampleBlock
@@ -19,7 +19,7 @@ from imu_calibration.effects.base import SECTIONS, SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import columns
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import CENTRED_FACTORS, Accumulator, WindowBlock
+from imu_calibration.estimation.accumulator import Accumulator, WindowBlock
 from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics, joined_motion, reduce_window
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
@@ -41,8 +41,14 @@ from imu_calibration.references.turntable.session_data import (
     owned_window,
 )
 
-SAVED_FORMAT = 'imu_calibration/accumulator/2'
-_PLAIN = ('counts', 'frame_id', 'first_stamp_ns', 'last_stamp_ns', 'largest_rate', 'largest_force', 'temperature_c')
+SAVED_FORMAT = 'imu_calibration/accumulator/3'
+SAVED_PARTS = ('accumulator', 'held_out', 'poses', 'counts', 'frame_id', 'first_stamp_ns', 'last_stamp_ns', 'largest_rate', 'largest_force',
+               'temperature_c', 'judged_from')
+"""Saved fields of a `SessionData`; windows with samples are not saved."""
+SAVED_TYPES: dict[str, Any] = {kind.__name__: kind for kind in (
+    dict, list, tuple, Counter, Accumulator, WindowBlock, WindowStatistics, SensorStatistics, HeldOut, HeldOutBlock, JointNames,
+    ModelChanges, ModelExtension)}
+"""Types that an archive may contain, in addition to arrays and plain values."""
 
 
 def to_bytes(gathered: SessionData, model: SensorModel, extension: ModelExtension = ModelExtension()) -> bytes:
@@ -52,93 +58,62 @@ def to_bytes(gathered: SessionData, model: SensorModel, extension: ModelExtensio
     Parameters
     ----------
     gathered : SessionData
-        Its least-squares system, the held-out blocks of the proof, poses and counts; windows with samples are not saved.
+        Its least-squares system, the held-out blocks of the proof, poses and counts.
     model : SensorModel
         The model of its columns.
     extension : ModelExtension
-        Effects added to the requested model.
+        Effects added to the requested model; the solution of a search is computed again.
 
     """
-    names = {name: list(getattr(model, name)) for name in (*SECTIONS, 'joint_names')}
-    header = {'format': SAVED_FORMAT, 'model': names | {'joint_errors': model.joint_names.errors},
-              'effects': model.definitions, 'demand': extension.to_mapping(),
-              'temperature_ref_c': model.temperature_ref_c,
-              'point': {name: np.asarray(value, float).tolist() for name, value in model.point.items()},
-              **_header_of(gathered.accumulator), 'judged_from': gathered.judged_from,
-              'held_out': [_header_of(block.accumulator) | {'pieces': [list(key) for key in block.pieces], 'counts': block.counts,
-                                                            'judged': block.judged} for block in gathered.held_out.blocks],
-              **{name: getattr(gathered, name) for name in _PLAIN}}
-    arrays: dict[str, Any] = {'header': np.frombuffer(json.dumps(header).encode(), np.uint8),
-                              **_arrays_of(gathered.accumulator, ''),
-                              'pose_times': np.array([(time, session) for time, session, _ in gathered.poses], float).reshape(-1, 2),
-                              'poses': np.array([position for _, _, position in gathered.poses], float)}
-    for number, block in enumerate(gathered.held_out.blocks):
-        arrays |= _arrays_of(block.accumulator, f'held_out{number}.')
-        arrays |= {f'held_out{number}.pieces.{k}': factor for k, factor in enumerate(block.pieces.values())}
+    arrays: list[np.ndarray] = []
+    of_model = {f.name: getattr(model, f.name) for f in fields(model) if f.name != 'catalogue'}
+    content = ({name: getattr(gathered, name) for name in SAVED_PARTS}, of_model, model.definitions, replace(extension, clipped=None))
+    header = json.dumps({'format': SAVED_FORMAT, 'content': _packed(content, arrays)})
     target = io.BytesIO()
-    np.savez(target, **arrays)
+    np.savez(target, header=np.frombuffer(header.encode(), np.uint8), numbers=np.concatenate([np.zeros(0), *map(np.ravel, arrays)]))
     return target.getvalue()
 
 
-def _header_of(accumulator):
-    return {'samples': accumulator.samples, 'windows': accumulator.windows, 'kinds': [row.kind for row in accumulator.rows],
-            'slow_rows': accumulator.slow_rows, 'block_length': accumulator.block_length, **_keys_of(accumulator),
-            'blocks': [{'session': block.session, 'start': block.start, 'windows': block.windows, **_keys_of(block)}
-                       for block in accumulator.blocks]}
+def _packed(value, arrays):
+    """Return a value as plain lists with the names of its types; its arrays are appended to `arrays`."""
+    if value is None or isinstance(value, (str, int, float)):
+        return value
+    if isinstance(value, np.ndarray):
+        arrays.append(value)
+        return ['array', value.shape]
+    parts = value.items() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else vars(value).values()
+    return [type(value).__name__, [_packed(part, arrays) for part in parts]]
 
 
-def _keys_of(part: Accumulator | WindowBlock):
-    """Return the keys of the factors, in the order of `_factors_of`."""
-    return {name: [list(key) for key in getattr(part, name)] for name in CENTRED_FACTORS}
+def _unpacked(value, numbers):
+    """Return the value that `_packed` wrote; its arrays are read from the beginning of the file `numbers`."""
+    if not isinstance(value, list):
+        return value
+    name, parts = value
+    if name == 'array':
+        return np.frombuffer(numbers.read(8 * math.prod(parts))).reshape(parts)
+    parts, kind = [_unpacked(part, numbers) for part in parts], SAVED_TYPES[name]
+    return kind(*parts) if is_dataclass(kind) else kind(dict(parts) if issubclass(kind, dict) else parts)   # a Counter would count pairs
 
 
-def _factors_of(part: Accumulator | WindowBlock, label):
-    return {f'{label}{name}.{k}': factor for name in CENTRED_FACTORS for k, factor in enumerate(getattr(part, name).values())}
-
-
-def _factors_in(header, arrays, label):
-    """Return the fields `CENTRED_FACTORS` of an Accumulator or WindowBlock."""
-    return {name: {tuple(key): arrays[f'{label}{name}.{k}'] for k, key in enumerate(header[name])} for name in CENTRED_FACTORS}
-
-
-def _arrays_of(accumulator, label):
-    rows = accumulator.rows
-    arrays = {f'{label}rows': np.array([(row.time, row.duration, row.encoder_step) for row in rows], float).reshape(-1, 3),
-              f'{label}whole': np.array([(row.count, row.session) for row in rows], np.int64).reshape(-1, 2)}
-    for sensor in sorted(rows[0].sensors) if rows else []:
-        for name in ('mean', 'noise_variance', 'inflation'):
-            arrays[f'{label}{sensor}.{name}'] = np.array([getattr(row.sensors[sensor], name) for row in rows])
-    arrays |= _factors_of(accumulator, label)
-    for number, block in enumerate(accumulator.blocks):
-        arrays |= _factors_of(block, f'{label}block{number}.')
-    return arrays
-
-
-def from_bytes(data: bytes, model: SensorModel) -> SessionData:
+def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
     """
-    Return the `SessionData` in an archive.
+    Return (SessionData, SensorModel of its columns, effects added to the requested model) in an archive.
 
     Raises
     ------
     DocumentError
-        When the bytes are no such archive, or it was gathered with another model.
+        When the bytes are no such archive.
 
     """
-    with _reading(data) as (header, arrays):
-        _check(header, model)
-        return _gathered(header, arrays)
-
-
-@contextmanager
-def _reading(data):
-    """Return (header, arrays) of an archive; raise a DocumentError when it is damaged."""
     try:
         with load_arrays(data) as arrays:
             header = json.loads(bytes(arrays['header']).decode())
             if header.get('format') != SAVED_FORMAT:
                 raise DocumentError(f"an accumulator must have the format '{SAVED_FORMAT}', got "
                                     f"{shortened(repr(header.get('format')))}; remove the file")
-            yield header, arrays
+            parts, of_model, definitions, extension = _unpacked(header['content'], io.BytesIO(arrays['numbers'].tobytes()))
+            return SessionData(**parts), SensorModel(**of_model, catalogue=CATALOGUE.with_definitions(definitions)), extension
     except ImuCalibrationError:
         raise
     except Exception as error:   # damaged archives, arrays and headers raise many kinds
@@ -146,27 +121,8 @@ def _reading(data):
                             f'a different format ({shortened(str(error), 200)}); remove the file', code='accumulator_damaged') from error
 
 
-def saved_model(data: bytes) -> SensorModel:
-    """Return the SensorModel of the columns of a saved accumulator; raises as `from_bytes` when it is damaged."""
-    with _reading(data) as (header, _):
-        return _model(header)
-
-
-def saved_extension(data: bytes) -> ModelExtension:
-    """Return the effects added to the requested model before a session was saved; raises as `from_bytes` when it is damaged."""
-    with _reading(data) as (header, _):
-        return ModelExtension.from_mapping(header.get('demand', {}), header['point'])
-
-
-def _model(header):
-    point = {name: np.array(value, float) for name, value in header['point'].items()}
-    effects, names = (tuple(header['model'][name]) for name in SECTIONS), header['model']['joint_names']
-    return SensorModel(*effects, JointNames.of(names, header['model'].get('joint_errors')), header['temperature_ref_c'], point,
-                       catalogue=CATALOGUE.with_definitions(header.get('effects', {})))
-
-
-def _check(header, model):
-    known = _model(header)
+def require_columns(known: SensorModel, model: SensorModel) -> None:
+    """Raise a DocumentError unless the columns of a saved accumulator, of the model `known`, are those of `model`."""
     if not known.has_columns_of(model):
         raise DocumentError(f'a saved accumulator must contain the columns of the requested model, it has {_text(known)}, '
                             f'requested is {_text(model)}; start without resume, or with the old model', code='other_model')
@@ -175,36 +131,6 @@ def _check(header, model):
 def _text(model):
     effects = ' / '.join('+'.join(getattr(model, sensor)) or 'none' for sensor in SECTIONS)
     return f'{effects} at {model.temperature_ref_c:g} C'
-
-
-def _gathered(header, arrays):
-    poses = [(float(time), int(session), position) for (time, session), position in zip(arrays['pose_times'], arrays['poses'])]
-    plain = {name: header[name] for name in _PLAIN}
-    plain['temperature_c'] = None if plain['temperature_c'] is None else tuple(plain['temperature_c'])
-    held_out = HeldOut()   # files of earlier versions have no blocks, and their session is unproven
-    for number, known in enumerate(header.get('held_out', ())):
-        pieces = {tuple(key): arrays[f'held_out{number}.pieces.{k}'] for k, key in enumerate(known['pieces'])}
-        accumulator = replace(held_out.blocks[number].accumulator, **_fields(known, arrays, f'held_out{number}.'))
-        held_out.blocks[number] = HeldOutBlock(accumulator, pieces, known['counts'], known['judged'])
-    return SessionData(Accumulator(**_fields(header, arrays, '')), held_out, poses=poses,
-                       judged_from=header.get('judged_from', 0.0), **plain)
-
-
-def _fields(header, arrays, label):
-    """Return the fields of an Accumulator."""
-    numbers, whole = arrays[f'{label}rows'], arrays[f'{label}whole']
-    columns = {sensor: [arrays[f'{label}{sensor}.{name}'] for name in ('mean', 'noise_variance', 'inflation')] for sensor in SENSORS
-               if f'{label}{sensor}.mean' in arrays.files}
-    rows = []
-    for k, kind in enumerate(header['kinds']):
-        statistics = {sensor: SensorStatistics(mean[k], np.zeros((0, mean.shape[1])), variance[k], inflation[k])
-                      for sensor, (mean, variance, inflation) in columns.items()}
-        time, duration, *step = map(float, numbers[k])   # files of earlier versions have no steps
-        rows.append(WindowStatistics(kind, time, duration, int(whole[k, 0]), statistics, int(whole[k, 1]), *step))
-    blocks = [WindowBlock(known['session'], known['start'], known['windows'], **_factors_in(known, arrays, f'{label}block{number}.'))
-              for number, known in enumerate(header['blocks'])]
-    counts = {name: Counter(header[name]) for name in ('slow_rows', 'samples', 'windows')}
-    return {'rows': rows, 'blocks': blocks, 'block_length': header['block_length'], **counts, **_factors_in(header, arrays, label)}
 
 
 class Collector:

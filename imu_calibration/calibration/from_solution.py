@@ -53,13 +53,6 @@ class ModelChanges:
                    ('lacking', list(self.lacking)), ('unexplained', self.unexplained), ('stamp_jitter', self.stamp_jitter))
         return {name: value for name, value in changes if value}
 
-    @classmethod
-    def from_mapping(cls, known: Mapping[str, Any]) -> 'ModelChanges':
-        """Return the changes from the mapping of `to_mapping`."""
-        return cls(tuple(known.get('added', ())), tuple(known.get('denied', ())), dict(known.get('implausible', {})),
-                   tuple(known.get('lacking', ())), dict(known.get('unexplained', {})),
-                   dict(known.get('stamp_jitter', {})))
-
 
 @dataclass(frozen=True, eq=False)
 class ModelExtension:
@@ -97,19 +90,6 @@ class ModelExtension:
     def is_nothing(self) -> bool:
         """Whether the solution of the requested model and its notes are unchanged."""
         return not (self.added or self.moves or self.clipped or self.changes != ModelChanges())
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the content that is saved with a session; the solution of a search is computed again."""
-        return {'added': [list(key) for key in self.added], 'changes': self.changes.to_mapping(),
-                'moves': [[dict(moved), weight] for moved, weight in self.moves]}
-
-    @classmethod
-    def from_mapping(cls, known: Mapping[str, Any], point: Mapping[str, Any]) -> 'ModelExtension':
-        """Return the ModelExtension from the mapping of `to_mapping`, with the separately saved point of the columns."""
-        added = tuple((str(sensor), str(name)) for sensor, name in known.get('added', ()))
-        return cls(added, {name: np.asarray(point[name], float) for _, name in added if name in point},
-                   ModelChanges.from_mapping(known.get('changes', {})),
-                   tuple((moved, float(weight)) for moved, weight in known.get('moves', ())))
 
 
 def motions_needed(solution: Solution, tolerances: np.ndarray, table: Table) -> dict[str, tuple[str, float]]:

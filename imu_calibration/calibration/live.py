@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.calibration import collector
-from imu_calibration.calibration.collector import LiveCollector, columns_at, copied
+from imu_calibration.calibration.collector import LiveCollector, columns_at, copied, from_bytes, require_columns, to_bytes
 from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, GroupState, group_states, table_coverage, waiting_groups
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, LiveSnapshot
@@ -58,8 +57,8 @@ class LiveCalibration:
     def __init__(self, table: Table, options: CalibrationOptions = CalibrationOptions(), settings: LiveSettings = LiveSettings(), *,
                  saved: bytes | None = None):
         self.table, self.options, self.settings = table, options, settings
-        self.earlier: SessionData | None = None
-        self.extension = ModelExtension() if saved is None or options.as_asked else collector.saved_extension(saved)
+        self.earlier, known, extension = (None, None, ModelExtension()) if saved is None else from_bytes(saved)
+        self.extension = ModelExtension() if options.as_asked else extension
         """Effects added to the requested model."""
         self._asked = choose_model(self.extension.options(options), table)
         self._waiting: list[SampleBlock] = []
@@ -71,11 +70,14 @@ class LiveCalibration:
         self.needs_linearising = False
         """Whether the last solution is outside the validity of its linearisation, and the store is too small to linearise again."""
         self._designs: dict[Window, tuple[slice, dict[str, np.ndarray]]] = {}
-        if saved is not None and self._asked.needs_temperature:
-            self._first_temperature_c = collector.saved_model(saved).temperature_ref_c
-            self._begin(self._asked.with_reference_temperature(self._first_temperature_c), saved)
-        elif not self._asked.needs_temperature:
-            self._begin(self._asked, saved)
+        asked = self._asked
+        if known is not None:
+            if asked.needs_temperature:
+                self._first_temperature_c = known.temperature_ref_c
+                asked = asked.with_reference_temperature(known.temperature_ref_c)
+            require_columns(known, asked)
+        if known is not None or not asked.needs_temperature:
+            self._begin(asked)
 
     observations = TableResult.observations
     needs_joints = True
@@ -162,8 +164,7 @@ class LiveCalibration:
             self._collector.push(held_back)
         return self._completed()
 
-    def _begin(self, model, saved=None):
-        self.earlier = None if saved is None else collector.from_bytes(saved, model)
+    def _begin(self, model):
         session = 0
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
@@ -227,7 +228,7 @@ class LiveCalibration:
 
     def saved(self, pending: bool = False) -> bytes:
         """Return all gathered data as bytes, for another run (`collector.to_bytes`)."""
-        return collector.to_bytes(self.gathered(pending), self._begun().model, self.extension)
+        return to_bytes(self.gathered(pending), self._begun().model, self.extension)
 
     def _begun(self) -> LiveCollector:
         if self._collector is None:

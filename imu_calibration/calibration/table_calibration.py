@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration import collector
-from imu_calibration.calibration.collector import GatherStep
+from imu_calibration.calibration.collector import GatherStep, from_bytes
 from imu_calibration.calibration.from_solution import (
     ModelChanges,
     document,
@@ -162,13 +161,11 @@ def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions 
         When no parameter is determined.
 
     """
-    model = collector.saved_model(data)
+    gathered, model, extension = from_bytes(data)
     if model.joint_names != table.joint_names:
         raise DocumentError(f"a saved accumulator must be of the joints {', '.join(table.joint_names)}, "
                             f"this is of {', '.join(model.joint_names) or 'none'}; "
                             'give the table or the arm that it was gathered on', key='table')
-    gathered = collector.from_bytes(data, model)
-    extension = collector.saved_extension(data)
     options = extension.options(options)
     return conclude(extension.applied(solve_gathered(gathered, model, options)), gathered, model, table=table, options=options,
                     changes=extension.changes).calibration

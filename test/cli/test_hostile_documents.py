@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from refusal import refused as expected
 
-from imu_calibration.calibration.collector import saved_model
+from imu_calibration.calibration.collector import from_bytes
 from imu_calibration.cli.fleet_run import csv_text, unit_rows
 from imu_calibration.core.documents import from_text
 from imu_calibration.core.errors import DocumentError, InputError
@@ -63,7 +63,7 @@ def test_a_saved_session_that_grows_a_thousandfold_is_refused():
 
 def load_accumulator():
     """Load zeros in place of an accumulator."""
-    return _refusal(saved_model, ('header', 'counts'))
+    return _refusal(from_bytes, ('header', 'counts'))
 
 
 def load_samples():
@@ -96,7 +96,7 @@ def test_damaged_sessions_are_one_line(damage):
         archive.writestr('header.npy', b'\x93NUMPY\1\0' + len(damage).to_bytes(2, 'little') + damage)
     for data in (damage, target.getvalue()):
         with pytest.raises(DocumentError):
-            saved_model(data)
+            from_bytes(data)
 
 
 def test_a_link_under_a_guessable_name_is_not_followed(tmp_path):

@@ -91,7 +91,7 @@ def test_what_is_frequent_is_how_the_recording_is(session):
 def test_a_session_that_goes_on_leaves_out_the_same(session):
     """Nothing but the accumulator is needed: live, after a restart, with any number of windows."""
     total = accumulated(leaned(session.windows, numbers(session.windows, WindowKind.STATIC)[5:6]))
-    again = from_bytes(to_bytes(SessionData(total), MODEL), MODEL).accumulator
+    again = from_bytes(to_bytes(SessionData(total), MODEL))[0].accumulator
     first, second = solve(total, MODEL), solve(again, MODEL)
     assert first.noise['accelerometer'].left_out == second.noise['accelerometer'].left_out
     np.testing.assert_array_equal(first.values, second.values)

@@ -132,7 +132,7 @@ def test_copies_and_merged_systems_go_their_own_way(windows):
 def test_blocks_survive_a_restart(windows):
     """A session that goes on where it was saved has the same standard deviations."""
     total = accumulated(measured(windows, lambda share: 5e-3 * share, 1))
-    again = from_bytes(to_bytes(SessionData(total), MODEL), MODEL).accumulator
+    again = from_bytes(to_bytes(SessionData(total), MODEL))[0].accumulator
     first, second = solve(total, MODEL), solve(again, MODEL)
     assert np.any(grown(first) > 1.0)
     np.testing.assert_array_equal(first.sd, second.sd)

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from imu_calibration.allan.document import noise_from_text, noise_to_text
 from imu_calibration.allan.identify import figures_of, identify_noise
-from imu_calibration.calibration.collector import from_bytes, saved_extension, saved_model, to_bytes
+from imu_calibration.calibration.collector import from_bytes, to_bytes
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.documents import from_text
@@ -204,9 +204,8 @@ def accumulator_seeds(_folder):
 
 
 def read_accumulator(data, _folder):
-    """Read the model and the demand of a saved session, then all of it."""
-    saved_extension(data)
-    from_bytes(data, saved_model(data))
+    """Read a saved session."""
+    from_bytes(data)
 
 
 def samples_seeds(_folder):
