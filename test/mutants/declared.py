@@ -276,7 +276,7 @@ FILES = _of(
     ('columns that grow without limit', 'LONGEST_EXPANDED', '5000', '10 ** 9', 'test_hostile_documents.py'),
     ('no limit to nesting', 'MAX_DOCUMENT_DEPTH', '20', '10 ** 9', 'test_documents.py'),
     ('aliases allowed', '_look_through', "_1 == 'AliasEvent' and (not (_2 and _3.anchor in _4))", 'False', 'test_documents.py'),
-    ('another model is resumed', '_check', 'not _1.has_columns_of(_2)', 'False', 'test_session_files.py test_live_calibration.py'),
+    ('another model is resumed', 'require_columns', 'not _1.has_columns_of(_2)', 'False', 'test_session_files.py test_live_calibration.py'),
     ('another temperature is resumed', 'SensorModel.has_columns_of', "('joint_names', 'temperature_ref_c', 'definitions')",
      "('joint_names', 'definitions')", 'test_live_calibration.py test_session_files.py'),
 )
@@ -337,7 +337,7 @@ LIVE = _of(
      'test_live_diagnosis.py::test_the_model_as_asked_stays'),
     ('windows that are gone are taken anew', 'LiveSnapshot.evidence', 'self.store.complete', 'True',
      'test_live_diagnosis.py::test_what_cannot_join_is_said_and_widens'),
-    ('a resumed session forgets what joined', 'LiveCalibration.__init__', '_1 is None or _2.as_asked', 'True',
+    ('a resumed session forgets what joined', 'LiveCalibration.__init__', '_1.as_asked', 'True',
      'test_live_diagnosis.py::test_a_resumed_session_keeps_what_joined'),
     ('what is denied live does not widen', 'LiveCalibration.solve', 'self.extension.applied(_1)', '_1',
      'test_live_diagnosis.py::test_what_cannot_join_is_said_and_widens'),
