@@ -14,7 +14,7 @@ import numpy as np
 from imu_calibration.core.errors import InputError, did_you_mean, shortened
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.csv_log import SUFFIXES, CsvBag
-from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, ImuDecoder, JointDecoder, taken_counts
+from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, JointDecoder, taken_counts
 from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
@@ -216,10 +216,8 @@ class Recording:
             deserialize = None if standard else self.deserializer(message_type)
             if message_type == JOINT_STATE_TYPE:
                 decoders[topic] = JointDecoder(joint_names, deserialize)
-            elif message_type == IMU_TYPE:
-                decoders[topic] = ImuDecoder(FrameChoice(topic, frame_id), deserialize)
             else:
-                decoders[topic] = Decoder(message_type, deserialize)
+                decoders[topic] = Decoder(message_type, deserialize, FrameChoice(topic, frame_id) if message_type == IMU_TYPE else None)
         return decoders
 
     def frames(self) -> list[str]:
@@ -352,20 +350,15 @@ class Ros1File:
         connections = [c for c in self.reader.connections if self.topics[c.id] in topics]
         pending, n_read = [], 0
         expected = sum(c.msgcount for c in connections)
-        messages = self.reader.messages(connections) if connections else iter(())
-        while True:
-            try:
-                connection, received_ns, data = next(messages)
-            except StopIteration:
-                break
-            except Exception as error:   # rosbags raises various errors on damaged files
-                self.lost[f'messages after damage ({error})'] = max(expected - n_read, 1)
-                break
-            pending.append((topics.index(self.topics[connection.id]), received_ns, bytes(data)))
-            n_read += 1
-            if len(pending) == STRETCH_MESSAGES:
-                yield _raw(pending)
-                pending = []
+        try:
+            for connection, received_ns, data in self.reader.messages(connections) if connections else ():
+                pending.append((topics.index(self.topics[connection.id]), received_ns, bytes(data)))
+                n_read += 1
+                if len(pending) == STRETCH_MESSAGES:
+                    yield _raw(pending)
+                    pending = []
+        except Exception as error:   # rosbags raises various errors on damaged files
+            self.lost[f'messages after damage ({error})'] = max(expected - n_read, 1)
         if pending:
             yield _raw(pending)
 

@@ -31,11 +31,13 @@ class Decoder:
         Imu or Temperature; JointState has its own class.
     deserialize : callable, optional
         Message bytes -> message object, for messages that are not standard CDR; each is then converted to it.
+    choice : object, optional
+        Its `wants` returns whether messages of a frame_id are used, as that of a FrameChoice.
 
     """
 
-    def __init__(self, message_type: str, deserialize: Callable | None = None):
-        self.message_type, self.name, self.deserialize = message_type, message_type.rpartition('/')[2], deserialize
+    def __init__(self, message_type: str, deserialize: Callable | None = None, choice: Any = None):
+        self.message_type, self.name, self.deserialize, self.choice = message_type, message_type.rpartition('/')[2], deserialize, choice
         self.dropped, self.notes = Counter(), Counter()
 
     def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
@@ -59,6 +61,8 @@ class Decoder:
 
     def decode_group(self, layout: MessageLayout, packed: Packed) -> Any:
         """Return the samples of messages of one layout, None for messages that are not wanted (raises UnusableMessage)."""
+        if self.choice is not None and not self.choice.wants(layout.names[0], len(packed)):
+            return None
         return (decode_imu if self.message_type == IMU_TYPE else decode_temperature)(layout, packed)
 
     def _stamped(self, samples, index, arrived_ns):
@@ -116,27 +120,6 @@ class FrameChoice:
 
     def _listed(self):
         return ', '.join(f"'{name}'" for name, _ in self.counts.most_common(KEPT_NAMES))
-
-
-class ImuDecoder(Decoder):
-    """
-    Decode Imu messages of the frame of a FrameChoice.
-
-    Parameters
-    ----------
-    choice : FrameChoice
-    deserialize : callable, optional
-        As for Decoder.
-
-    """
-
-    def __init__(self, choice: FrameChoice, deserialize: Callable | None = None):
-        super().__init__(IMU_TYPE, deserialize)
-        self.choice = choice
-
-    def decode_group(self, layout: MessageLayout, packed: Packed) -> Any:
-        """As for Decoder; None for other frames."""
-        return super().decode_group(layout, packed) if self.choice.wants(layout.names[0], len(packed)) else None
 
 
 class JointDecoder(Decoder):

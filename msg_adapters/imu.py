@@ -1,11 +1,9 @@
 """Imu and Temperature messages."""
 
-import struct
-
 import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
-from msg_adapters.layout import FRAME_OFFSET, MessageError, MessageLayout, Packed, aligned, open_header, overlapping
+from msg_adapters.layout import FRAME_OFFSET, MessageError, MessageLayout, Packed, aligned, frame_head, open_header, overlapping
 
 IMU_TYPE = 'sensor_msgs/msg/Imu'
 
@@ -67,10 +65,8 @@ def patch_imu_group(layout: MessageLayout, packed: Packed, fields: dict[str, np.
         table[:, offset:offset + 8 * count] = np.ascontiguousarray(values, dtype=layout.order + 'f8').view(np.uint8)
     if frame_id is None or frame_id == layout.names[0]:
         return table
-    text = frame_id.encode() + b'\0'
-    head = struct.pack(layout.order + 'I', len(text)) + text
-    head = head.ljust(aligned(FRAME_OFFSET + len(head), 8) - FRAME_OFFSET, b'\0')
-    rows = np.broadcast_to(np.frombuffer(head, np.uint8), (len(table), len(head)))
+    head = np.frombuffer(frame_head(frame_id, layout.order), np.uint8)
+    rows = np.broadcast_to(head, (len(table), len(head)))
     return np.concatenate([table[:, :FRAME_OFFSET], rows, table[:, layout.offsets['orientation'][0]:]], axis=1)
 
 

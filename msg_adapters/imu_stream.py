@@ -8,7 +8,7 @@ import numpy as np
 
 from imu_calibration.preprocessing.recording_evidence import MESSAGE_QUANTITIES, MessageEvidence
 from msg_adapters.imu import find_imu_layout
-from msg_adapters.layout import MessageError
+from msg_adapters.layout import MessageError, frame_head
 
 STAMP_AT = 4
 HEAD_AT = 12
@@ -58,9 +58,7 @@ class ImuStream:
         self._head_end = HEAD_AT + 4 + struct.unpack_from(layout.order + 'I', data, HEAD_AT)[0]   # the padding after it is arbitrary
         self._head = data[HEAD_AT:self._head_end]
         self._rate_at, self._force_at = layout.offsets['rate_s'][0], layout.offsets['force_s'][0]
-        encoded = (layout.names[0] if self._frame_out is None else self._frame_out).encode() + b'\0'
-        self._head_out = struct.pack(layout.order + 'I', len(encoded)) + encoded
-        self._head_out += b'\0' * (-(HEAD_AT - 4 + len(self._head_out)) % 8)
+        self._head_out = frame_head(layout.names[0] if self._frame_out is None else self._frame_out, layout.order)
         self._size = len(data)
         return layout.names[0]
 

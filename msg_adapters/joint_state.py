@@ -63,23 +63,18 @@ def decode_joints(layout: MessageLayout, packed: Packed, joint_names: Sequence[s
         When a joint is missing or the message has no positions.
 
     """
-    columns = joint_columns(layout.names, layout.offsets['position'][1], joint_names)
+    names = list(layout.names)
+    if any(name not in names for name in joint_names):
+        raise UnusableMessage(MISSING_JOINT)
+    if layout.offsets['position'][1] != len(names):
+        raise UnusableMessage(NO_POSITION)
+    columns = [names.index(name) for name in joint_names]
     position = layout.column(packed, 'position')[:, columns]
-    if layout.offsets['velocity'][1] == len(layout.names):
+    if layout.offsets['velocity'][1] == len(names):
         velocity = layout.column(packed, 'velocity')[:, columns]
     else:
         velocity = np.full_like(position, np.nan)
     return JointSamples(layout.stamp_ns(packed), position, velocity, tuple(joint_names))
-
-
-def joint_columns(names: Sequence[str], n_positions: int, joint_names: Sequence[str]) -> list[int]:
-    """Return the positions of the joints in a message with `names` (raises UnusableMessage)."""
-    names = list(names)
-    if any(name not in names for name in joint_names):
-        raise UnusableMessage(MISSING_JOINT)
-    if n_positions != len(names):
-        raise UnusableMessage(NO_POSITION)
-    return [names.index(name) for name in joint_names]
 
 
 class _Walk:

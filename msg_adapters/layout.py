@@ -70,6 +70,8 @@ class Packed:
     @classmethod
     def chain(cls, parts: Sequence['Packed']) -> 'Packed':
         """Return the messages of all parts, one part after the other."""
+        if len(parts) == 1:
+            return parts[0]
         sizes = [len(part.buffer) for part in parts]
         start = [part.start + sum(sizes[:k]) for k, part in enumerate(parts)]
         return cls(*(np.concatenate(each) for each in ([part.buffer for part in parts], start, [part.size for part in parts])))
@@ -196,22 +198,6 @@ class UnusableMessage(MessageError):
     """A well-formed message that gives no sample; its text is the reason to count it under."""
 
 
-def byte_order(data: bytes) -> str:
-    """
-    Return '<' or '>' from the encapsulation header of a serialized message.
-
-    Raises
-    ------
-    MessageError
-        When the message is not plain CDR (XCDR1), the only representation that ROS 2 uses for these types.
-
-    """
-    try:
-        return _BYTE_ORDERS[bytes(data[:2])]
-    except KeyError:
-        raise MessageError(f'encapsulation must be plain CDR (0x0000 or 0x0001), got 0x{bytes(data[:2]).hex()}') from None
-
-
 def clean_name(name: str | bytes) -> str:
     """Return a frame, topic, type or joint name without control characters, at most `LONGEST_NAME` bytes; a recording may contain any."""
     raw = name.encode(errors='replace') if isinstance(name, str) else bytes(name)
@@ -237,8 +223,10 @@ class Header(NamedTuple):
 
 
 def open_header(data: bytes) -> Header:
-    """Return the Header of a serialized message (raises MessageError)."""
-    order = byte_order(data)
+    """Return the Header of a serialized message (raises MessageError); plain CDR (XCDR1) is the only representation in ROS 2."""
+    order = _BYTE_ORDERS.get(bytes(data[:2]))
+    if order is None:
+        raise MessageError(f'encapsulation must be plain CDR (0x0000 or 0x0001), got 0x{bytes(data[:2]).hex()}')
     if len(data) < FRAME_OFFSET + 4:
         raise MessageError(f'a stamped message has at least {FRAME_OFFSET + 4} bytes, got {len(data)}')
     sec, nanosec, length = _STARTS[order].unpack_from(data, ENCAPSULATION_SIZE)
@@ -248,6 +236,12 @@ def open_header(data: bytes) -> Header:
     if end > len(data):
         raise MessageError(f'a frame_id of {length} bytes ends at byte {end}, the message has {len(data)}')
     return Header(order, sec * NS_PER_S + nanosec, bytes(data[FRAME_OFFSET + 4:end - 1 if length else end]), end)
+
+
+def frame_head(frame_id: str, order: str = '<') -> bytes:
+    """Return the bytes of a frame_id after the stamp: its length, text and padding to the doubles that follow."""
+    text = frame_id.encode() + b'\0'
+    return struct.pack(order + 'I', len(text)) + text + bytes(-(4 + len(text)) % 8)
 
 
 def aligned(position: int, size: int) -> int:

@@ -3,14 +3,14 @@
 import threading
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from imu_calibration.core.samples import SampleBlock
 from msg_adapters.decode import Decoder, JointDecoder, taken_counts
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
-from msg_adapters.layout import MessageLayout, Packed, UnusableMessage, clean_name
+from msg_adapters.layout import Packed, UnusableMessage, clean_name
 
 
 class LiveGatherer:
@@ -32,21 +32,11 @@ class LiveGatherer:
     """
 
     def __init__(self, joint_names: Sequence[str] | None = None, max_messages: int = 1_000_000, frame_id: str | None = None):
-        imu = Decoder(IMU_TYPE) if frame_id is None else FrameDecoder(frame_id)
+        imu = Decoder(IMU_TYPE, choice=None if frame_id is None else OneFrame(clean_name(frame_id)))
         self._topics = {'imu': _Topic(imu, max_messages), 'joints': _Topic(JointDecoder(joint_names), max_messages),
                         'temperature': _Topic(Decoder(TEMPERATURE_TYPE), max_messages)}
-
-    def add_imu(self, message: bytes, sent_ns: int = 0) -> None:
-        """Add an Imu message, serialized, and when it was sent, ns."""
-        self._topics['imu'].add(message, sent_ns)
-
-    def add_joints(self, message: bytes, sent_ns: int = 0) -> None:
-        """Add a JointState message."""
-        self._topics['joints'].add(message, sent_ns)
-
-    def add_temperature(self, message: bytes, sent_ns: int = 0) -> None:
-        """Add a Temperature message."""
-        self._topics['temperature'].add(message, sent_ns)
+        self.add_imu, self.add_joints, self.add_temperature = (topic.add for topic in self._topics.values())
+        """Add a serialized message, and when it was sent, ns."""
 
     def __len__(self) -> int:
         return sum(len(topic.waiting) for topic in self._topics.values())
@@ -66,27 +56,19 @@ class LiveGatherer:
         return SampleBlock(**samples, dropped=dropped, notes=notes)
 
 
-class FrameDecoder(Decoder):
-    """
-    Decode Imu messages of one frame; messages of other frames are counted as dropped.
+@dataclass
+class OneFrame:
+    """Selection of the messages of one frame; other messages are counted as dropped."""
 
-    Parameters
-    ----------
-    frame_id : str
-        The frame; '' selects that of the first message.
+    frame_id: str
+    """The frame; '' selects that of the first message."""
 
-    """
-
-    def __init__(self, frame_id: str = ''):
-        super().__init__(IMU_TYPE)
-        self.frame_id = clean_name(frame_id)
-
-    def decode_group(self, layout: MessageLayout, packed: Packed) -> Any:
-        """As for Decoder; raises UnusableMessage for another frame."""
-        self.frame_id = self.frame_id or layout.names[0]
-        if layout.names[0] != self.frame_id:
+    def wants(self, frame_id: str, _n_messages: int) -> bool:
+        """Return whether messages of a frame are used; raises UnusableMessage for another frame."""
+        self.frame_id = self.frame_id or frame_id
+        if frame_id != self.frame_id:
             raise UnusableMessage(f"Imu message of another frame than '{self.frame_id}'")
-        return super().decode_group(layout, packed)
+        return True
 
 
 class _Topic:
@@ -96,7 +78,7 @@ class _Topic:
         self.decoder, self.max_messages = decoder, max_messages
         self.lock, self.waiting, self.n_lost = threading.Lock(), deque(), 0
 
-    def add(self, message, sent_ns):
+    def add(self, message: bytes, sent_ns: int = 0) -> None:
         with self.lock:
             self.waiting.append((message, sent_ns))
             if len(self.waiting) > self.max_messages:

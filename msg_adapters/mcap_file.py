@@ -249,17 +249,15 @@ class McapFile(StorageFile):
     def _stretches(self, topics):
         wanted = {number for topic in topics for number in self.topic_ids.get(topic, ())}
         with closing(read_ahead(self._joined_pieces(wanted))) as pieces:
-            for buffer, messages in pieces:
-                packed = Packed(buffer, messages.start, messages.size)
-                yield Stretch(messages.channel, lambda index, packed=packed: (index, packed.select(index)),
-                              partial(log_times, buffer, messages))
+            for channel, packed in pieces:
+                yield Stretch(channel, lambda index, packed=packed: (index, packed.select(index)), partial(log_times, packed))
 
     def _joined_pieces(self, wanted):
         """Join pieces to stretches."""
         waiting, n_waiting = [], 0
         for piece in self._pieces(wanted):
             waiting.append(piece)
-            n_waiting += len(piece[0])
+            n_waiting += len(piece[1].buffer)
             if n_waiting >= STRETCH_BYTES:
                 yield _join(waiting)
                 waiting, n_waiting = [], 0
@@ -267,15 +265,15 @@ class McapFile(StorageFile):
             yield _join(waiting)
 
     def _pieces(self, wanted):
-        """Yield (buffer, Messages) for each chunk with wanted channels and each run of messages outside of chunks."""
+        """Yield (channel ids, Packed) for each chunk with wanted channels and each run of messages outside of chunks."""
         for opcode, position, length, walked in self._records():
             if opcode == CHUNK:
                 indexes = self._indexes_behind(position + length)
                 if not indexes or any(number in wanted for number, _ in indexes):
                     yield from self._chunk(position, length, indexes)
             elif opcode == MESSAGE:
-                self._register(walked[2])
-                yield walked[:2]
+                self._register(walked[1])
+                yield walked[0]
             elif opcode in (SCHEMA, CHANNEL):
                 self._register([(opcode, self._read(position, length))])
 
@@ -296,13 +294,13 @@ class McapFile(StorageFile):
             self._register(others)
             if not whole or end < len(buffer):
                 self._lose('chunks that end early', 1)
-        yield buffer, messages
+        yield messages
 
     def _records(self):
         """
         Yield (opcode, position, length, None) of the records of the data section; a truncated chunk is yielded with its remaining bytes.
 
-        Messages outside of chunks are yielded in groups, with (buffer, Messages, other records) in place of None.
+        Messages outside of chunks are yielded in groups, with ((channel ids, Packed), other records) in place of None.
         """
         position = len(MAGIC)
         self.n_unpacked = 0
@@ -322,7 +320,7 @@ class McapFile(StorageFile):
                 messages, others, end = walk(buffer)
                 ahead = min(2 * ahead, STRETCH_BYTES) if 2 * end > len(buffer) else FIRST_BYTES
                 if end:
-                    yield MESSAGE, position, end, (buffer[:end], messages, others)
+                    yield MESSAGE, position, end, (messages, others)
                 position = position + end if end else self._resume(position)
             else:
                 yield opcode, position + PREFIX.size, length, None
@@ -378,11 +376,11 @@ class McapFile(StorageFile):
             if indexes and all(number in self.channels for number, _ in indexes):
                 counts.update({number: len(offsets) for number, offsets in indexes})
             elif opcode == CHUNK:
-                for _, messages in self._chunk(position, length, indexes):
-                    counts.update(messages.channel.tolist())
+                for channel, _ in self._chunk(position, length, indexes):
+                    counts.update(channel.tolist())
             elif opcode == MESSAGE:
-                self._register(walked[2])
-                counts.update(walked[1].channel.tolist())
+                self._register(walked[1])
+                counts.update(walked[0][0].tolist())
             elif opcode in (SCHEMA, CHANNEL):
                 self._register([(opcode, self._read(position, length))])
         self.lost.clear()   # it will be counted again when the messages are read
@@ -402,11 +400,6 @@ class McapFile(StorageFile):
 
 
 def _join(pieces):
-    """Join (buffer, Messages) pieces into one."""
-    if len(pieces) == 1:
-        return pieces[0]
-    base = np.cumsum([0] + [len(buffer) for buffer, _ in pieces[:-1]])
-    channel = np.concatenate([messages.channel for _, messages in pieces])
-    start = np.concatenate([messages.start + shift for (_, messages), shift in zip(pieces, base, strict=True)])
-    size = np.concatenate([messages.size for _, messages in pieces])
-    return np.concatenate([buffer for buffer, _ in pieces]), type(pieces[0][1])(channel, start, size)
+    """Join (channel ids, Packed) pieces into one."""
+    channels, parts = zip(*pieces, strict=True)
+    return np.concatenate(channels), Packed.chain(parts)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from msg_adapters.layout import clean_name, overlapping
+from msg_adapters.layout import Packed, clean_name, overlapping
 
 PACKED_PIECE_BYTES = 1 << 20
 LARGEST_CHUNK, LARGEST_MESSAGE = 64 << 20, 32 << 20
@@ -152,17 +152,6 @@ class Channel(NamedTuple):
     """Serialization of the messages."""
 
 
-class Messages(NamedTuple):
-    """Where the messages of a buffer lie, in file order."""
-
-    channel: np.ndarray
-    """Channel ids, int64, shape (n,)."""
-    start: np.ndarray
-    """First byte of the data of each message, int64, shape (n,)."""
-    size: np.ndarray
-    """Bytes of the data, int64, shape (n,)."""
-
-
 class McapDamage(Exception):
     """A record that violates the format."""
 
@@ -227,14 +216,15 @@ def unpack_chunk(content: memoryview, decompress: Callable) -> tuple[bytes | mem
     return records, whole
 
 
-def indexed_messages(buffer: np.ndarray, indexes: Sequence[tuple[float, np.ndarray]]) -> Messages | None:
+def indexed_messages(buffer: np.ndarray, indexes: Sequence[tuple[float, np.ndarray]]) -> tuple[np.ndarray, Packed] | None:
     """
     Find the messages of a chunk by its message indexes.
 
     Returns
     -------
-    messages : Messages or None
-        None when the indexes do not account for every byte of the chunk (definitions in between, or a wrong index).
+    (channel, messages) : (ndarray, Packed) or None
+        Channel ids, int64, shape (n,), and the messages in file order; None when the indexes do not account for every byte of the chunk
+        (definitions in between, or a wrong index).
 
     """
     if not indexes or len(buffer) < MESSAGE_PREFIX:
@@ -249,16 +239,17 @@ def indexed_messages(buffer: np.ndarray, indexes: Sequence[tuple[float, np.ndarr
     gapless = offset[0] == 0 and np.array_equal(offset + PREFIX.size + length, np.append(offset[1:], len(buffer)))
     if not gapless or (buffer[offset] != MESSAGE).any() or (overlapping(buffer, '<u2')[offset + PREFIX.size] != channel).any():
         return None
-    return Messages(channel, offset + MESSAGE_PREFIX, length - 22)
+    return channel, Packed(buffer, offset + MESSAGE_PREFIX, length - 22)
 
 
-def walk(buffer: np.ndarray) -> tuple[Messages, list[tuple[int, bytes]], int]:
+def walk(buffer: np.ndarray) -> tuple[tuple[np.ndarray, Packed], list[tuple[int, bytes]], int]:
     """
     Step through records until a chunk, the end, or an incomplete or impossible one; runs of one size are parsed at once.
 
     Returns
     -------
-    messages : Messages
+    (channel, messages) : (ndarray, Packed)
+        Channel ids, int64, shape (n,), and the messages in file order.
     others : list of (opcode, content)
         Records that are not messages.
     end : int
@@ -286,12 +277,12 @@ def walk(buffer: np.ndarray) -> tuple[Messages, list[tuple[int, bytes]], int]:
     offset = np.concatenate(offsets) if offsets else np.zeros(0, np.int64)
     length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64) if len(offset) else offset
     channel = overlapping(buffer, '<u2')[offset + PREFIX.size].astype(np.int64) if len(offset) else offset
-    return Messages(channel, offset + MESSAGE_PREFIX, length - 22), others, position
+    return (channel, Packed(buffer[:position], offset + MESSAGE_PREFIX, length - 22)), others, position
 
 
-def log_times(buffer: np.ndarray, messages: Messages, index: np.ndarray) -> np.ndarray:
-    """Return the receive times of some Messages of a buffer, int64."""
-    return overlapping(buffer, '<i8')[messages.start[index] - 16]
+def log_times(messages: Packed, index: np.ndarray) -> np.ndarray:
+    """Return the receive times of some messages in their records, int64."""
+    return overlapping(messages.buffer, '<i8')[messages.start[index] - 16]
 
 
 def is_record(opcode: int) -> bool:

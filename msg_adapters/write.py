@@ -14,7 +14,7 @@ from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import DEFAULT_TOPICS, standard_definition
 from msg_adapters.imu import FIELDS, IMU_TYPE, N_DOUBLES, TEMPERATURE_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, encode_trajectory
-from msg_adapters.layout import NS_PER_S, Packed
+from msg_adapters.layout import NS_PER_S, Packed, frame_head
 
 NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0)
 UNKNOWN_COVARIANCE = (0.0,) * 9
@@ -37,13 +37,13 @@ def encode_imu(imu: ImuSamples, *, force_cov: ArrayLike = UNKNOWN_COVARIANCE, ra
                'rate_cov': np.ravel(rate_cov), 'force_cov': np.ravel(force_cov)}
     for name, value in columns.items():
         doubles[:, FIELDS[name]] = value
-    return _table(imu.stamp_ns, _head(imu.frame_id, 8), [doubles])
+    return _table(imu.stamp_ns, frame_head(imu.frame_id), [doubles])
 
 
 def encode_joints(joints: JointSamples, with_velocity: bool = True) -> np.ndarray:
     """Serialize JointSamples (see `encode_imu`), with an empty sequence of velocities when these are left out."""
     count = struct.pack('<I', len(joints.names))
-    head = _head('', 4) + count
+    head = _padded(_string(''), 4) + count
     for name in joints.names:
         head = _padded(head + _string(name), 4)
     velocity = [count + bytes(4), joints.velocity] if with_velocity and joints.names else [bytes(4)]
@@ -54,18 +54,7 @@ def encode_temperature(temperature: TemperatureSamples) -> np.ndarray:
     """Serialize TemperatureSamples (see `encode_imu`); the variance is unknown, 0."""
     doubles = np.zeros((len(temperature), 2), dtype='<f8')
     doubles[:, 0] = temperature.temperature_c
-    return _table(temperature.stamp_ns, _head('', 8), [doubles])
-
-
-def rows(table: np.ndarray) -> list[memoryview]:
-    """Return one memoryview per row of a contiguous byte table."""
-    view, size = table.data.cast('B'), table.shape[1]
-    return [view[start:start + size] for start in range(0, table.size, size)]
-
-
-def _head(frame_id, alignment):
-    """Bytes of the frame_id after the stamp, padded for the field that follows."""
-    return _padded(_string(frame_id), alignment)
+    return _table(temperature.stamp_ns, frame_head(''), [doubles])
 
 
 def _string(text):

@@ -36,8 +36,9 @@ from imu_calibration.nodes.session_files import LiveSession, SessionFiles, refer
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.provenance import provenance_with
+from msg_adapters.layout import Packed
 from msg_adapters.live import LiveGatherer
-from msg_adapters.write import encode_imu, rows
+from msg_adapters.write import encode_imu
 
 INPUT_DEPTH = 5000
 """Messages that may wait: 2.5 s at 2 kHz, while numpy holds the interpreter."""
@@ -196,7 +197,7 @@ class CalibrationNode(Node):
         self._publish(self._document, String(data=text))
 
     def _publish_residuals(self, residuals: Any) -> None:
-        for message in rows(encode_imu(residuals)):
+        for message in Packed.of_rows(encode_imu(residuals)).views():
             self._publish(self._residual, bytes(message))
 
     def _publish_coverage(self, coverage: Any) -> None:

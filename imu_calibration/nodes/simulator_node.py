@@ -40,7 +40,8 @@ from imu_calibration.simulation.session import SimulationOptions, random_values
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import trajectory_from_message
-from msg_adapters.write import encode_imu, encode_joints, encode_temperature, rows
+from msg_adapters.layout import Packed
+from msg_adapters.write import encode_imu, encode_joints, encode_temperature
 
 STRETCH_SECONDS = 0.1
 """Seconds of simulated time that are computed together, times the time factor; as playback makes some such stretches ahead, a
@@ -184,7 +185,7 @@ class SimulatorNode(Node):
             parts.append((self._to['imu/truth'], block.truth, encode_imu))
         due = np.concatenate([(samples.stamp_ns - self._simulation.start_ns) * 1e-9 for _, samples, _ in parts])
         publishers = [publisher for publisher, samples, _ in parts for _ in range(len(samples))]
-        messages = [message for _, samples, encode in parts if len(samples) for message in rows(encode(samples))]
+        messages = [message for _, samples, encode in parts if len(samples) for message in Packed.of_rows(encode(samples)).views()]
         order = np.argsort(due, kind='stable')
         return Batch(due[order], [publishers[k] for k in order], [messages[k] for k in order], until)
 

@@ -14,7 +14,7 @@ from msg_adapters.decode import OTHER_FRAME, FrameChoice
 from msg_adapters.definitions import standard_definition
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed
-from msg_adapters.write import encode_imu, rows
+from msg_adapters.write import encode_imu
 
 from worlds.physics_hand import hold_and_turn
 
@@ -26,7 +26,7 @@ def two(tmp_path_factory):
     path = tmp_path_factory.mktemp('frames') / 'bag'
     with BagWriter(path) as bag:
         topic = bag.add_topic('/imus', standard_definition(IMU_TYPE))
-        messages = [rows(encode_imu(ImuSamples(imu.stamp_ns, imu.force_s + [shift, 0, 0], imu.rate_s, frame)))
+        messages = [Packed.of_rows(encode_imu(ImuSamples(imu.stamp_ns, imu.force_s + [shift, 0, 0], imu.rate_s, frame))).views()
                     for frame, shift in (('front', 0.0), ('rear', 1.0))]
         bag.write(np.full(2 * len(imu), topic), np.repeat(imu.stamp_ns, 2), Packed.join([each for pair in zip(*messages) for each in pair]))
     return path, imu

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.document.calibration_text import calibration_from_text
-from msg_adapters.write import encode_imu, encode_joints, rows
+from msg_adapters.layout import Packed
+from msg_adapters.write import encode_imu, encode_joints
 
 from worlds.live_sessions import make_session
 
@@ -50,7 +51,7 @@ def send(bench, imu, joints, topics=('imu/data_raw', 'joint_states')):
     to = [bench.node.create_publisher(kind, topic, qos) for kind, topic in zip((Imu, JointState), topics)]
     bench.until(lambda: all(publisher.get_subscription_count() for publisher in to), 'subscriptions')
     queue = [(k / len(samples), publisher, bytes(message)) for publisher, samples, encode in zip(to, (imu, joints), (encode_imu, encode_joints))
-             for k, message in enumerate(rows(encode(samples)))]
+             for k, message in enumerate(Packed.of_rows(encode(samples)).views())]
     for k, (_, publisher, message) in enumerate(sorted(queue, key=lambda entry: entry[0])):
         publisher.publish(message)
         if k % 100 == 0:
@@ -192,6 +193,6 @@ def test_joint_states_without_positions_and_zero_stamps_are_named(bench, session
     assert not bench.heard('outer, middle, inner', level='warning') and not bench.heard('outer, middle, inner', level='error')
     to = bench.node.create_publisher(Imu, 'imu/data_raw', 1000)
     bench.until(to.get_subscription_count, 'a subscription')
-    for message in rows(encode_imu(replace(imu, stamp_ns=np.zeros(len(imu), np.int64)))):
+    for message in Packed.of_rows(encode_imu(replace(imu, stamp_ns=np.zeros(len(imu), np.int64)))).views():
         to.publish(bytes(message))
     bench.until(lambda: bench.figure(STREAMS, 'Imu zero stamp') == '400', 'the same on /diagnostics')

@@ -8,7 +8,8 @@ import pytest
 from imu_calibration.core.units import DEG
 from imu_calibration.document.calibration_text import calibration_to_text
 from msg_adapters.imu_stream import ImuStream
-from msg_adapters.write import encode_imu, rows
+from msg_adapters.layout import Packed
+from msg_adapters.write import encode_imu
 
 from worlds.drives import drive, plain_calibration
 
@@ -22,7 +23,7 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures('executor_only')]
 OK, WARN, ERROR = range(3)
 STATUS = 'compensator_node: health'
 WORLD = drive(6, 6, warm_up=(0.0, 0.0, 0.3 * DEG))
-MESSAGES = [bytes(row) for row in rows(encode_imu(WORLD.imu))]
+MESSAGES = [bytes(row) for row in Packed.of_rows(encode_imu(WORLD.imu)).views()]
 
 
 def start(bench, tmp_path, conditions=None, **parameters):
@@ -52,7 +53,7 @@ def test_a_drift_is_told_at_the_stops(bench, tmp_path):
 
 def test_a_driver_that_publishes_g_is_told_the_unit(bench, tmp_path):
     node = start(bench, tmp_path)
-    converted(node, [bytes(row) for row in rows(encode_imu(replace(WORLD.imu, force_s=WORLD.imu.force_s / 9.80665)))])
+    converted(node, [bytes(row) for row in Packed.of_rows(encode_imu(replace(WORLD.imu, force_s=WORLD.imu.force_s / 9.80665))).views()])
     bench.until(lambda: bench.lines().get(STATUS, (OK,))[0] == ERROR, 'an error')
     assert bench.figure(STATUS, 'outcome') == 'unit' and bench.heard('m/s^2', level='error') == 1 and not bench.heard(level='warning')
 

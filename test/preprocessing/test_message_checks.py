@@ -15,7 +15,8 @@ from imu_calibration.preprocessing.recording_evidence import (
     check_messages,
 )
 from msg_adapters.imu_stream import ImuHeads
-from msg_adapters.write import encode_imu, rows
+from msg_adapters.layout import Packed
+from msg_adapters.write import encode_imu
 
 KNOWN = np.diag([1e-4, 2e-4, 3e-4])
 NONE = np.diag([ABSENT_MARK, 0.0, 0.0])
@@ -74,7 +75,7 @@ def test_single_stamps_that_are_late_are_no_clock():
 def messages(frame_id, stamp_ns=(10**18, 10**18 + 10**7)):
     """Serialized messages."""
     readings = np.ones((len(stamp_ns), 3))
-    return [bytes(row) for row in rows(encode_imu(ImuSamples(np.array(stamp_ns), readings, readings, frame_id)))]
+    return [bytes(row) for row in Packed.of_rows(encode_imu(ImuSamples(np.array(stamp_ns), readings, readings, frame_id))).views()]
 
 
 def test_what_stands_in_the_bytes_is_what_is_checked():

@@ -182,10 +182,11 @@ class Publisher:
 
     def send(self, imu, joints, per_second=4000):
         """Publish ImuSamples and JointSamples merged by their place in the recording, about so many per second."""
-        from msg_adapters.write import encode_imu, encode_joints, rows
+        from msg_adapters.layout import Packed
+        from msg_adapters.write import encode_imu, encode_joints
         queue = []
         for publisher, samples, encode in ((self.imu, imu, encode_imu), (self.joints, joints, encode_joints)):
-            messages = rows(encode(samples)) if len(samples) else []
+            messages = Packed.of_rows(encode(samples)).views() if len(samples) else []
             queue += [(k / len(messages), publisher, message) for k, message in enumerate(messages)]
         queue.sort(key=lambda entry: entry[0])
         step = max(per_second // 50, 1)
