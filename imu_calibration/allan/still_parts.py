@@ -72,7 +72,7 @@ def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], dict[st
     margin = int(np.ceil(SETTLING / seconds)) if seconds else 0
     inner = shrunk(still, margin)
     parts, short = [], 0.0
-    for first, last in _unbroken_runs(inner, np.diff(chunks.time) > BRIDGE):
+    for first, last in runs_of(inner, np.diff(chunks.time) > BRIDGE):
         part = _part(chunks, first, last)
         if part.seconds >= MIN_STILL_SECONDS:
             parts.append(part)
@@ -134,15 +134,6 @@ def _centre(values):
     """Return the median and the robust standard deviation."""
     middle = np.median(values)
     return middle, 1.4826 * np.median(np.abs(values - middle))
-
-
-def _unbroken_runs(mask, broken):
-    """Return (first, last + 1) of the runs of True, cut where `broken` separates two neighbours."""
-    edges = []
-    for first, last in runs_of(mask):
-        cuts = first + 1 + np.flatnonzero(broken[first:last - 1])
-        edges += list(zip([first, *cuts], [*cuts, last]))
-    return edges
 
 
 def _part(chunks, first, last):

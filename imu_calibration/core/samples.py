@@ -209,9 +209,12 @@ class NominalScaling:
                        rate_s=(imu.rate_s - self.gyroscope_offset) / self.gyroscope_scale)
 
 
-def runs_of(flags: ArrayLike) -> np.ndarray:
-    """Return (start, stop) of each run of true flags, half open, shape (n_runs, 2)."""
-    return np.flatnonzero(np.diff(np.concatenate([[False], np.asarray(flags, bool), [False]]))).reshape(-1, 2)
+def runs_of(flags: ArrayLike, broken: ArrayLike = False) -> np.ndarray:
+    """Return (start, stop) of each run of true flags, half open, shape (n_runs, 2); cut where `broken`, (n - 1,), separates neighbours."""
+    flags = np.asarray(flags, bool)
+    joined = flags[1:] & flags[:-1] & np.logical_not(broken)
+    starts, stops = flags & ~np.append(False, joined), flags & ~np.append(joined, False)
+    return np.column_stack([np.flatnonzero(starts), np.flatnonzero(stops) + 1])
 
 
 def smallest_step(readings: np.ndarray, least: float = 1e-9) -> np.ndarray:

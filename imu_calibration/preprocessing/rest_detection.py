@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.samples import ImuSamples, runs_of
 from imu_calibration.preprocessing.window import WindowSettings
 
 SPANS = (0.25, 1.0)
@@ -47,7 +47,11 @@ def quiet_beside_joints(force_s: np.ndarray, rate_s: np.ndarray, period: float, 
 
     Parameters
     ----------
-    force_s, rate_s, period, ratio, longest
+    force_s, rate_s : array, shape (n, 3)
+        Readings in any unit.
+    period : float
+        Sampling period, s.
+    ratio, longest
         As for `quiet_samples`.
     floors : (QuietFloor, QuietFloor)
         Running floors of the readings and of their means.
@@ -59,13 +63,14 @@ def quiet_beside_joints(force_s: np.ndarray, rate_s: np.ndarray, period: float, 
     array of bool, shape (n,)
 
     """
-    quiet = quiet_samples(force_s, rate_s, period, ratio=ratio, longest=longest, floor=floors[0], resting=resting)
+    cells = Cells(force_s, rate_s, period)
+    quiet = quiet_samples(cells, ratio=ratio, longest=longest, floor=floors[0], resting=resting)
     width = 2 * int(round(BELOW / period / 2)) + 1
-    below = quiet_samples(low_passed(force_s, width), low_passed(rate_s, width), period, ratio=ratio, longest=longest, floor=floors[1],
-                          resting=resting, spans=SPANS[1:])
+    below = quiet_samples(Cells(low_passed(force_s, width), low_passed(rate_s, width), period), ratio=ratio, longest=longest,
+                          floor=floors[1], resting=resting, spans=SPANS[1:])
     if quiet[resting].all() or width < 3:
         return quiet
-    return quiet | (below & _steady(force_s, rate_s, period, ratio=ratio, resting=resting))
+    return quiet | (below & _steady(cells, ratio=ratio, resting=resting))
 
 
 def low_passed(values: np.ndarray, width: int) -> np.ndarray:
@@ -82,22 +87,18 @@ def _low_passed_piece(values, first, last, width):
     return low_passed(values[start:last + reach], width)[first - start:last - start]
 
 
-def _steady(force_s, rate_s, period, *, ratio, resting):
+def _steady(cells, *, ratio, resting):
     """Return a mask of the samples in a short span at rest whose variance is about the minimum of the spans around."""
-    cell = max(1, min(int(_GRID / period), len(force_s)))
-    edges = np.append(np.arange(0, len(force_s) - cell + 1, cell), len(force_s))
-    width = min(max(int(np.ceil(_MIN_QUIET_SAMPLES / cell)), int(round(SPANS[0] / period / cell))), len(edges) - 1)
-    variance = np.stack([_CellSums(values, edges).variance(width) for values in (force_s, rate_s)])
-    at_rest = _free_of(~np.logical_and.reduceat(resting, edges[:-1]), width)
-    around = 2 * int(round(STEADY_SECONDS / period / cell)) + 1
-    least = minimum_filter1d(np.where(at_rest, variance, np.inf), around, axis=1, mode='nearest')
-    floor = np.maximum(least, [[least_variance(force_s)], [least_variance(rate_s)]])
-    steady = _covered(at_rest & np.all(variance <= ratio**2 * floor, axis=0), width)
-    return np.repeat(shrunk(steady, int(np.ceil(_GUARD / period / cell))), np.diff(edges))
+    width = cells.width(SPANS[0])
+    variance, at_rest = cells.variance(width), _free_of(~cells.all_of(resting), width)
+    around = 2 * int(round(cells.cells_in(STEADY_SECONDS))) + 1
+    least = minimum_filter1d(np.where(at_rest[:, None], variance, np.inf), around, axis=0, mode='nearest')
+    floor = np.maximum(least, cells.least)
+    return cells.samples(_covered(at_rest & np.all(variance <= ratio**2 * floor, axis=1), width))
 
 
-def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, ratio: float, longest: float, floor: QuietFloor,
-                  resting: np.ndarray | None = None, spans: tuple[float, ...] = SPANS) -> np.ndarray:
+def quiet_samples(cells: 'Cells', *, ratio: float, longest: float, floor: QuietFloor, resting: np.ndarray | None = None,
+                  spans: tuple[float, ...] = SPANS) -> np.ndarray:
     """
     Return a mask of the samples in a quiet span.
 
@@ -106,10 +107,8 @@ def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, rat
 
     Parameters
     ----------
-    force_s, rate_s : array, shape (n, 3)
-        Readings in any unit.
-    period : float
-        Sampling period, s.
+    cells : Cells
+        Of the readings.
     ratio : float
         Largest ratio of standard deviations to the quiet ones.
     longest : float
@@ -126,28 +125,23 @@ def quiet_samples(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, rat
     array of bool, shape (n,)
 
     """
-    n = len(force_s)
-    cell = max(1, min(int(_GRID / period), n))
-    edges = np.append(np.arange(0, n - cell + 1, cell), n)  # the last cell takes the remainder
-    sums = [_CellSums(values, edges) for values in (force_s, rate_s)]
-    least = np.array([least_variance(values) for values in (force_s, rate_s)])
-    at_rest = None if resting is None else np.logical_and.reduceat(resting, edges[:-1])
-    quiet, shorter = np.ones(len(edges) - 1, bool), np.full(2, np.inf)
+    at_rest = None if resting is None else cells.all_of(resting)
+    quiet, shorter = np.ones(len(cells.edges) - 1, bool), np.full(2, np.inf)
     for span in spans:
-        width = min(max(int(np.ceil(_MIN_QUIET_SAMPLES / cell)), int(round(min(span, longest) / period / cell))), len(quiet))
-        variance = np.stack([item.variance(width) for item in sums], axis=1)
+        width = cells.width(min(span, longest))
+        variance = cells.variance(width)
         limit = floor.update(span, _chunk_floor(variance, width, at_rest))
         if limit is None and np.isinf(shorter).all():
-            return np.zeros(n, bool)
+            return np.zeros(cells.edges[-1], bool)
         # at rest the variance hardly grows with the span; otherwise the quietest part was moving as well
-        shorter = limit = np.maximum(shorter if limit is None else np.minimum(limit, _GROWTH * shorter), least)
+        shorter = limit = np.maximum(shorter if limit is None else np.minimum(limit, _GROWTH * shorter), cells.least)
         calm = np.all(variance <= ratio ** 2 * limit, axis=1)
         quiet &= _covered(calm, width)
         if width > 1 and resting is None:   # a change of attitude between two samples: no quiet span contains it
             across = _covered(calm, width - 1)
             quiet[:-1] &= across
             quiet[1:] &= across
-    return np.repeat(shrunk(quiet, int(np.ceil(_GUARD / period / cell))), np.diff(edges))
+    return cells.samples(quiet)
 
 
 def _chunk_floor(variance, width, at_rest):
@@ -173,23 +167,57 @@ def least_variance(values: np.ndarray) -> float:
     return np.sum(step ** 2 / 4) + 3 * (1e-5 * np.abs(some).max(initial=1e-2)) ** 2
 
 
-class _CellSums:
-    """Sums over cells of samples, from which variances over any span of cells follow."""
+class Cells:
+    """
+    Sums over cells of samples, from which variances over any span of cells follow.
 
-    def __init__(self, values, edges):
-        sums, squares = [], np.zeros(len(edges) - 1)
-        for axis in values.T:   # one at a time: a long recording is large
-            centred = axis - axis.mean()
-            sums.append(np.add.reduceat(centred, edges[:-1]))
-            squares += np.add.reduceat(np.square(centred, out=centred), edges[:-1])
-        self._count, self._sum, self._square = edges, _running(np.array(sums)), _running(squares)
+    Parameters
+    ----------
+    force_s, rate_s : array, shape (n, 3)
+        Readings in any unit.
+    period : float
+        Sampling period, s.
 
-    def variance(self, width):
-        """Return the variance over `width` cells from each cell on, axes added."""
-        count = self._count[width:] - self._count[:-width]
-        total = self._sum[:, width:] - self._sum[:, :-width]
-        square = self._square[width:] - self._square[:-width]
-        return np.maximum(square - np.einsum('ij,ij->j', total, total) / count, 0.0) / np.maximum(count - 1, 1)
+    """
+
+    def __init__(self, force_s: np.ndarray, rate_s: np.ndarray, period: float):
+        n = len(force_s)
+        self._period, self._size = period, max(1, min(int(_GRID / period), n))
+        self.edges = np.append(np.arange(0, n - self._size + 1, self._size), n)  # the last cell takes the remainder
+        self.least = np.array([least_variance(values) for values in (force_s, rate_s)])
+        """Of force and rate."""
+        self._sums = []
+        for values in (force_s, rate_s):
+            sums, squares = [], np.zeros(len(self.edges) - 1)
+            for axis in values.T:   # one at a time: a long recording is large
+                centred = axis - axis.mean()
+                sums.append(np.add.reduceat(centred, self.edges[:-1]))
+                squares += np.add.reduceat(np.square(centred, out=centred), self.edges[:-1])
+            self._sums.append((_running(np.array(sums)), _running(squares)))
+
+    def cells_in(self, seconds: float) -> float:
+        """Return the number of cells in a time."""
+        return seconds / self._period / self._size
+
+    def width(self, seconds: float) -> int:
+        """Return the number of cells of a span, at least that of `_MIN_QUIET_SAMPLES`."""
+        return min(max(int(np.ceil(_MIN_QUIET_SAMPLES / self._size)), int(round(self.cells_in(seconds)))), len(self.edges) - 1)
+
+    def variance(self, width: int) -> np.ndarray:
+        """Return the variances of force and rate over `width` cells from each cell on, axes added, shape (n_spans, 2)."""
+        count, variances = self.edges[width:] - self.edges[:-width], []
+        for sums, squares in self._sums:
+            total, square = sums[:, width:] - sums[:, :-width], squares[width:] - squares[:-width]
+            variances.append(np.maximum(square - np.einsum('ij,ij->j', total, total) / count, 0.0) / np.maximum(count - 1, 1))
+        return np.stack(variances, axis=1)
+
+    def all_of(self, flags: np.ndarray) -> np.ndarray:
+        """Return the cells in which all samples are flagged."""
+        return np.logical_and.reduceat(flags, self.edges[:-1])
+
+    def samples(self, mask: np.ndarray) -> np.ndarray:
+        """Return the samples of the cells of a mask, without a margin at its ends."""
+        return np.repeat(shrunk(mask, int(np.ceil(self.cells_in(_GUARD)))), np.diff(self.edges))
 
 
 def _running(values):
@@ -260,7 +288,8 @@ def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> 
     if not np.any(step > 0):
         return []
     period = np.median(step[step > 0]) / 1e9
-    quiet = quiet_samples(imu.force_s, imu.rate_s, period, ratio=settings.quiet_ratio, longest=settings.static_minimum, floor=QuietFloor())
+    quiet = quiet_samples(Cells(imu.force_s, imu.rate_s, period), ratio=settings.quiet_ratio, longest=settings.static_minimum,
+                          floor=QuietFloor())
     found = [piece for piece in _intervals(imu.stamp_ns, quiet, period, settings) if _keeps_attitude(imu.force_s[piece], period)]
     found = _at_one_rate(imu.rate_s, found, period, settings.static_minimum)
     return _not_turning(imu.rate_s, _trimmed(imu, found, period, settings.static_minimum))
@@ -268,14 +297,11 @@ def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> 
 
 def _intervals(stamp_ns, quiet, period, settings):
     time = (stamp_ns - stamp_ns[0]) / 1e9
-    hole = np.diff(time) > max(settings.gap, 5 * period)
-    begins = quiet & np.concatenate([[True], ~quiet[:-1] | hole])
-    ends = quiet & np.concatenate([~quiet[1:] | hole, [True]])
     found = []
-    for first, last in zip(np.flatnonzero(begins), np.flatnonzero(ends), strict=True):
+    for first, stop in runs_of(quiet, np.diff(time) > max(settings.gap, 5 * period)):
         start = first if first == 0 else int(np.searchsorted(time, time[first] + settings.settling))
-        if start <= last and time[last] - time[start] + period >= settings.static_minimum:
-            found.append(slice(int(start), int(last) + 1))
+        if start < stop and time[stop - 1] - time[start] + period >= settings.static_minimum:
+            found.append(slice(int(start), int(stop)))
     return found
 
 

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.samples import ImuSamples, runs_of
 
 NOISE_SAMPLES = 32
 """Samples per estimate of the noise."""
@@ -53,7 +53,8 @@ class SpikeFilter:
     def push(self, samples: ImuSamples) -> list[ImuSamples]:
         """Return a list of the ImuSamples with a decision; the last `SPIKE_REACH` are buffered."""
         passed = []
-        for part in _without_breaks(samples):
+        for start, stop in runs_of(np.ones(len(samples)), np.diff(samples.stamp_ns) > BREAK_NS):
+            part = samples.select(slice(start, stop))
             if self._held is not None and part.stamp_ns[0] - self._held.stamp_ns[-1] > BREAK_NS:
                 passed += self.finish()
             self._held = part if self._held is None else type(part).concatenate([self._held, part])
@@ -132,14 +133,6 @@ def _median(values):
     """Return the median along axis 1; a sort of short columns is several times faster than the partition of `np.median`."""
     ordered, count = np.sort(values, axis=1), values.shape[1]
     return 0.5 * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])
-
-
-def _without_breaks(samples):
-    """Yield the stretches between breaks."""
-    edges = [0, *(np.flatnonzero(np.diff(samples.stamp_ns) > BREAK_NS) + 1), len(samples)]
-    for start, stop in zip(edges, edges[1:]):
-        if stop > start:
-            yield samples.select(slice(start, stop))
 
 
 def _knocked(beside, limit):

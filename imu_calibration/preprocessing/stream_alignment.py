@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
+from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, runs_of
 from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch
 from imu_calibration.preprocessing import window_cutter
 from imu_calibration.preprocessing.rest_detection import QUIETNESS_REACH, QuietFloor, quiet_beside_joints
@@ -217,9 +217,8 @@ class MotionChunks:
         time = (joints.stamp_ns - self._start_ns) / 1e9
         step = np.diff(time)
         joint_limit = max(limit, 3 * float(np.median(step))) if len(step) else limit
-        bounds = np.concatenate([[0], np.flatnonzero(step > joint_limit) + 1, [len(time)]])
         runs = [JointRun(time[a:b], joints.position[a:b], joints.velocity[a:b], settings=self._settings, noise_rad=self._noise_rad)
-                for a, b in zip(bounds[:-1], bounds[1:], strict=True) if b - a >= LEAST_READINGS]
+                for a, b in runs_of(np.ones(len(time)), step > joint_limit) if b - a >= LEAST_READINGS]
         return runs, limit
 
     def _phases(self, time, runs, final):

@@ -1,6 +1,6 @@
 """Phases of the joints (rest, constant rate, motion), and windows cut in them."""
 
-from collections import deque
+from collections import Counter, deque
 from enum import IntEnum
 from math import ceil
 
@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 from scipy.special import ndtri
 
+from imu_calibration.core.samples import runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.kinematics.joint_curve import fit_joint_curve
 from imu_calibration.kinematics.joint_motion import JointMotion, encoder_step
@@ -246,9 +247,8 @@ def _period(samples):
     return (samples.time[-1] - samples.time[0]) / max(len(samples) - 1, 1)
 
 
-_WINDOW_KINDS, _UNUSED_REASONS = tuple(WindowKind), tuple(UnusedReason)
-UNUSED, STATIC, SPIN, DYNAMIC = range(len(_WINDOW_KINDS))
-_SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT, _REST_TOO_SHORT = range(1, len(_UNUSED_REASONS))
+_USES = (*tuple(WindowKind)[1:], *tuple(UnusedReason)[1:])
+_STATIC, _SPIN, _DYNAMIC, _SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT, _REST_TOO_SHORT = range(len(_USES))
 _MIN_WINDOW_SAMPLES = 5
 
 
@@ -257,11 +257,11 @@ class WindowCutter:
     Converts samples, in order and in pieces of any length, to windows; buffers a few window lengths at most.
 
     Three steps, each with the least delay:
-    runs of one phase that are too short for it become motion, samples get a kind, runs of one kind become windows.
+    runs of one phase that are too short for it become motion, samples get a use, runs of one use become windows or are unused.
     """
 
     def __init__(self, settings: WindowSettings, short_rest: float, keep_unused: bool = False):
-        self.counts = {}
+        self.counts = Counter()
         self._settings, self._short_rest, self._keep_unused = settings, short_rest, keep_unused
         self._waiting = None
         self._phase_before = None
@@ -293,7 +293,7 @@ class WindowCutter:
 
     def _decided(self, samples, final):
         """Return the samples whose phase is final, and that phase; buffer the remaining samples."""
-        starts, stops = _runs(samples.phase, samples.after_gap)
+        starts, stops = _runs(samples.phase, samples.after_gap).T
         time, settings = samples.time, self._settings
         phase = samples.phase.copy()
         original = samples.phase[starts]
@@ -320,49 +320,42 @@ class WindowCutter:
     def _cut(self, samples, phase):
         if not len(samples):
             return []
-        kind, reason = self._kinds(samples, phase)
-        after_gap = samples.after_gap.copy()
+        use = self._uses(samples, phase)
         if self._open is not None:
-            before, kind_before, reason_before = self._open
-            samples = PhasedSamples.concatenate([before, samples])
-            kind, reason = np.concatenate([kind_before, kind]), np.concatenate([reason_before, reason])
-            after_gap = samples.after_gap
-        starts, stops = _runs(kind * 8 + reason, after_gap)
+            before, use_before = self._open
+            samples, use = PhasedSamples.concatenate([before, samples]), np.append(np.full(len(before), use_before), use)
         windows = []
-        for start, stop in zip(starts, stops, strict=True):
-            cut_off, start = self._shed(samples, start, stop, kind[start], reason[start])
+        for start, stop in _runs(use, samples.after_gap):
+            cut_off, start = self._shed(samples, start, stop, use[start])
             windows += cut_off
-            rest = samples.select(slice(start, stop)), kind[start:stop], reason[start:stop]
+            rest = samples.select(slice(start, stop)), use[start]
             if stop < len(samples):
                 windows += self._close(*rest)
         self._open = rest
         return windows
 
-    def _shed(self, samples, start, stop, kind, reason):
+    def _shed(self, samples, start, stop, use):
         """Cut complete windows off a run while it is twice as long as a window, open or not: independent of the time of arrival."""
-        windows, longest = [], self._longest(kind)
+        windows, longest = [], self._longest(use)
         while samples.time[stop - 1] - samples.time[start] >= 2 * longest:
             cut = int(np.searchsorted(samples.time, samples.time[start] + longest))
-            windows += self._finished(samples.select(slice(start, cut)), kind, reason)
+            windows += self._finished(samples.select(slice(start, cut)), use)
             start = cut
         return windows, start
 
-    def _kinds(self, samples, phase):
+    def _uses(self, samples, phase):
         time, settings = samples.time, self._settings
         unknown = samples.after_loss
         calm_rest = (phase == STILL) & samples.quiet & ~unknown
         steady = (phase == STEADY) & ~unknown
         rested = time - self._last_time(time, ~calm_rest, '_disturbed') >= settings.settling
         settled = time - self._last_time(time, ~steady, '_ramped') >= settings.settling
-        kind = np.full(len(time), DYNAMIC, np.int8)
-        reason = np.zeros(len(time), np.int8)
-        for at_phase, good, wanted in ((STILL, rested, STATIC), (STEADY, settled, SPIN)):
-            kind[phase == at_phase] = np.where(good[phase == at_phase], wanted, UNUSED)
-        reason[kind == UNUSED] = _SETTLING
-        reason[(kind == UNUSED) & (phase == STILL) & ~samples.quiet] = _NOT_QUIET
-        early = time < settings.turn_on
-        kind[early], reason[early] = UNUSED, _TURN_ON
-        return kind, reason
+        use = np.full(len(time), _DYNAMIC)
+        for at_phase, good, wanted in ((STILL, rested, _STATIC), (STEADY, settled, _SPIN)):
+            use[phase == at_phase] = np.where(good[phase == at_phase], wanted, _SETTLING)
+        use[(use == _SETTLING) & (phase == STILL) & ~samples.quiet] = _NOT_QUIET
+        use[time < settings.turn_on] = _TURN_ON
+        return use
 
     def _last_time(self, time, event, name):
         """Return the time of the last event at or before each sample, and remember the last one under `name`."""
@@ -370,49 +363,44 @@ class WindowCutter:
         setattr(self, name, last[-1])
         return last
 
-    def _close(self, samples, kind, reason):
-        """Return the windows of a complete run of one kind, cut into equal pieces of at most the longest length."""
-        length = samples.time[-1] - samples.time[0]
-        pieces = max(1, int(np.ceil(length / self._longest(kind[0]))))
-        bounds = np.linspace(0, len(samples), pieces + 1).astype(int)
-        windows = []
-        for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
-            windows += self._finished(samples.select(slice(start, stop)), kind[0], reason[0])
-        return windows
+    def _close(self, samples, use):
+        """Return the windows of a complete run of one use, cut into equal pieces of at most the longest length."""
+        pieces = max(1, ceil((samples.time[-1] - samples.time[0]) / self._longest(use)))
+        return [window for part in _equal_parts(samples, pieces) for window in self._finished(part, use)]
 
-    def _least(self, kind):
+    def _least(self, use):
         settings = self._settings
-        return {UNUSED: 0.0, STATIC: settings.static_minimum, SPIN: settings.spin_minimum, DYNAMIC: settings.dynamic_minimum}[kind]
+        return {_STATIC: settings.static_minimum, _SPIN: settings.spin_minimum, _DYNAMIC: settings.dynamic_minimum}.get(use, 0.0)
 
-    def _longest(self, kind):
+    def _longest(self, use):
         # halves of a window slightly above the longest length must not be below the shortest
-        return max(self._settings.window_maximum, 2 * self._least(kind))
+        return max(self._settings.window_maximum, 2 * self._least(use))
 
-    def _finished(self, samples, kind, reason):
+    def _finished(self, samples, use):
         n = len(samples)
         length = (samples.time[-1] - samples.time[0]) * n / max(n - 1, 1)
-        if length < self._least(kind) or (kind != UNUSED and n < _MIN_WINDOW_SAMPLES):
-            kind, reason = UNUSED, _REST_TOO_SHORT if kind == STATIC else _TOO_SHORT
-        key = _UNUSED_REASONS[reason] if kind == UNUSED else _WINDOW_KINDS[kind]
-        self.counts[key] = self.counts.get(key, 0) + n
-        if kind == UNUSED and not self._keep_unused:
-            return []
-        if kind == STATIC:
+        if length < self._least(use) or (use <= _DYNAMIC and n < _MIN_WINDOW_SAMPLES):
+            use = _REST_TOO_SHORT if use == _STATIC else _TOO_SHORT
+        self.counts[_USES[use]] += n
+        if use > _DYNAMIC:
+            return [make_window(samples, WindowKind.UNUSED, _USES[use])] if self._keep_unused else []
+        if use == _STATIC:
             self._wander.rested(samples)
-        pieces = self._wander.pieces(samples) if kind == DYNAMIC else 1
-        bounds = np.linspace(0, n, pieces + 1).astype(int)
-        return [make_window(samples.select(slice(start, stop)), _WINDOW_KINDS[kind], _UNUSED_REASONS[reason])
-                for start, stop in zip(bounds[:-1], bounds[1:], strict=True)]
+        pieces = self._wander.pieces(samples) if use == _DYNAMIC else 1
+        return [make_window(part, _USES[use]) for part in _equal_parts(samples, pieces)]
+
+
+def _equal_parts(samples, count):
+    bounds = np.linspace(0, len(samples), count + 1).astype(int)
+    return [samples.select(slice(start, stop)) for start, stop in zip(bounds[:-1], bounds[1:], strict=True)]
 
 
 def _runs(value, broken):
-    """Return starts and stops of runs of equal values that are not broken."""
-    begins = np.concatenate([[True], (value[1:] != value[:-1]) | broken[1:]])
-    starts = np.flatnonzero(begins)
-    return starts, np.append(starts[1:], len(value))
+    """Return (start, stop) of runs of equal values that are not broken before a sample."""
+    return runs_of(np.ones(len(value)), (value[1:] != value[:-1]) | broken[1:])
 
 
-ACCEPTED = (*_WINDOW_KINDS[1:], *_UNUSED_REASONS[1:], 'edge of joints')
+ACCEPTED = (*_USES, 'edge of joints')
 """Counts of complete samples; the last six are excluded from windows on purpose."""
 
 
