@@ -62,24 +62,20 @@ class SampleCompensation:
         """Return corrected rate and specific force, six floats, or None if no sample can be published; `counts` has the reason."""
         total, dt = wx + wy + wz + fx + fy + fz, self.dt
         if total - total != 0.0 or dt is None:
-            self.refuse('no temperature yet' if dt is None else 'not finite')
+            self.counts['no temperature yet' if dt is None else 'not finite'] += 1
             return None
         slope = self.slope.push(stamp_ns, wx, wy, wz) if self._follows else NO_SLOPE
         vibration = self.vibration.push(self.slope.period or 0.0, (fx, fy, fz)) if self._shakes else NO_SLOPE
         ux, uy, uz, vx, vy, vz = self._kernel(fx, fy, fz, wx, wy, wz, *slope, dt, self.branch.now, *vibration)
         squared = vx * vx + vy * vy + vz * vz
         if squared != squared:
-            self.refuse('outside the invertible range')
+            self.counts['outside the invertible range'] += 1
             return None
         self.last = ((fx, fy, fz), (wx, wy, wz), slope, dt, self.branch.now, vibration)
         if squared > self.fastest_squared:
             self.fastest_squared = squared
         self.corrected += 1
         return vx, vy, vz, ux, uy, uz
-
-    def refuse(self, reason: str) -> None:
-        """Count a sample that cannot be corrected."""
-        self.counts[reason] += 1
 
     def covariances(self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """

@@ -12,7 +12,7 @@ from imu_calibration.compensation.compensate import Corrected, FittedErrors, Tra
 from imu_calibration.compensation.covariance import Uncertainty, is_known
 from imu_calibration.compensation.rate_slope import WITHOUT, RateSlope
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import ImuSamples, TemperatureSamples
+from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.effects.base import Role
 from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch
 from imu_calibration.preprocessing.stamping import REGULAR, StampLine, describe_stamps
@@ -230,29 +230,12 @@ def compensate_readings(calibration: FittedErrors, samples: Vectors | ImuSamples
 
 def _as_samples(calibration, force_s, rate_s, time):
     """Return arrays as ImuSamples; times may be missing if no arm needs angular acceleration."""
-    force, rate = (_vectors(values, name) for values, name in ((force_s, 'specific force'), (rate_s, 'angular rate')))
-    if len(force) != len(rate):
-        raise InputError(f'specific force and angular rate must be of the same instants, got {len(force)} and {len(rate)}; give both',
-                         code='lengths_differ')
     if time is None:
         if np.any(arms_of(calibration)):
             raise InputError('the calibration has lever arms and needs the time of each reading, none was given; give `time` in seconds',
                              code='time_missing')
-        time = np.arange(len(force)) * 0.01
-    seconds = np.asarray(time, float)
-    if seconds.shape != (len(force),):
-        raise InputError(f'there must be one time for each reading, shape ({len(force)},), got {seconds.shape}; correct `time`',
-                         code='time_shape')
-    start = seconds[0] if len(seconds) else 0.0
-    return ImuSamples(np.round((seconds - start) * 1e9).astype(np.int64), force, rate, calibration.frame_id)
-
-
-def _vectors(values, name):
-    array = np.asarray(values, float) if values is not None else np.empty(0)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f'the {name} must be an array of shape (n, 3), got {array.shape if values is not None else "none"}; correct it',
-                         code='shape')
-    return array
+        time = np.arange(len(force_s)) * 0.01
+    return SampleBlock.from_arrays(time, force_s, rate_s).imu
 
 
 def _as_temperatures(temperature_c, stamp_ns):

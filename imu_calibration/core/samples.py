@@ -46,7 +46,9 @@ class AlignedArrays:
 def _joined(values):
     if any(value is None for value in values):
         return None
-    return np.concatenate(values) if isinstance(values[0], np.ndarray) else values[0]
+    if isinstance(values[0], np.ndarray):
+        return np.concatenate(values)
+    return values[0].concatenate(values) if isinstance(values[0], AlignedArrays) else values[0]
 
 
 class JoinedParts:
@@ -180,9 +182,9 @@ class SampleBlock:
         given = {'time': time, 'force': force, 'rate': rate, **angles, **({} if heat is None else {'temperature_c': heat})}
         for name, values in given.items():
             wanted = (n, 3) if name in ('force', 'rate') else (n,)
-            if values.shape != wanted or n < 2:
-                raise InputError(f'{name} must have shape {str(wanted).replace("-1", "n")} with at least 2 rows, got {values.shape}; '
-                                 'correct the array')
+            if values.shape != wanted or n < 1:
+                raise InputError(f'{name} must have shape {str(wanted).replace("-1", "n")} with at least one row, got {values.shape}; '
+                                 'correct the array', code='array_shape')
         if not np.isfinite(time).all():
             raise InputError(f'every time must be finite, got {np.count_nonzero(~np.isfinite(time))} that are not; remove these rows')
         stamp_ns = stamps_of(time)

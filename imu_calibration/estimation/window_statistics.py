@@ -12,9 +12,8 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import References, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import triangular
-from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window
+from imu_calibration.preprocessing.window import Window, joined_motion
 
 PIECE_TIME = 0.25
 """Length of a piece, s: noise averages out, and a sweep of a table is still several pieces."""
@@ -172,15 +171,6 @@ def reduce_window(window: Window, model: SensorModel, table: Table, *, session: 
                   with_pieces: bool = False) -> WindowStatistics:
     """Reduce one window to its statistics; arguments as in `reduce_windows`."""
     return reduce_windows([window], model, table, session=session, column_function=column_function, with_pieces=with_pieces)[0]
-
-
-def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None]:
-    """Return the motion of all windows in one piece, and the temperatures (window means where static), or None."""
-    known = [[w.temperature_c.mean()] if w.kind == 'static' else w.temperature_c for w in windows if w.temperature_c is not None]
-    temperatures = np.concatenate(known) if len(known) == len(windows) else None
-    if len(windows) == 1:
-        return windows[0].motion, temperatures
-    return JointMotion.concatenate(window.motion for window in windows), temperatures
 
 
 def _reduced(window, designs, session, inputs):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from imu_calibration.kinematics.rotations import Reference, align, earth_rate_n, rotation
+from imu_calibration.kinematics.rotations import Reference, align, cross, earth_rate_n, rotation
 from imu_calibration.kinematics.table import Table, axis_angles, axis_error_directions, base_heading_deg
 
 if TYPE_CHECKING:
@@ -317,10 +317,10 @@ def _lean(columns, step, angle, rate, acceleration):
         vector += np.einsum('dn,k->dkn', lean.real, step.across[0]) + np.einsum('dn,k->dkn', lean.imag, step.across[1])
     if joint.sag:
         up, spin, alpha = columns[:, -4], columns[:, -3], columns[:, -2]
-        moves = _cross(up, spin)   # up is fixed in space; the rotation of the Earth is negligible relative to the sag
+        moves = cross(up, spin)   # up is fixed in space; the rotation of the Earth is negligible relative to the sag
         axis = np.zeros((3, 1))
         axis[step.third] = step.sense * joint.sag
-        vector += np.stack([_cross(each, axis) for each in (up, moves, _cross(moves, spin) + _cross(up, alpha))])
+        vector += np.stack([cross(each, axis) for each in (up, moves, cross(moves, spin) + cross(up, alpha))])
     for which in (first, second):
         columns = _turn(columns, which, *vector[:, which])
     return columns
@@ -328,20 +328,14 @@ def _lean(columns, step, angle, rate, acceleration):
 
 def _arm_force(rate, alpha, arm):
     """Return ``alpha x arm + rate x (rate x arm)``, all shape (3, n) or (3, 1)."""
-    return _cross(alpha, arm) + rate * (rate * arm).sum(axis=0) - arm * (rate * rate).sum(axis=0)
-
-
-def _cross(first, second):
-    """Return the cross product of vectors, shape (3, n)."""
-    return np.stack([first[1] * second[2] - first[2] * second[1], first[2] * second[0] - first[0] * second[2],
-                     first[0] * second[1] - first[1] * second[0]])
+    return cross(alpha, arm) + rate * (rate * arm).sum(axis=0) - arm * (rate * rate).sum(axis=0)
 
 
 def _slide(columns, axis, position, rate, acceleration):
     """Bring `columns` into the link that slides along `axis`, shape (3, 1)."""
     slid = np.array(np.broadcast_to(columns, columns.shape[:2] + (len(position),)))
     spin, alpha = slid[:, -3], slid[:, -2]
-    slid[:, -1] += _arm_force(spin, alpha, axis * position) + 2 * rate * _cross(spin, axis) + axis * acceleration
+    slid[:, -1] += _arm_force(spin, alpha, axis * position) + 2 * rate * cross(spin, axis) + axis * acceleration
     return slid
 
 

@@ -10,7 +10,6 @@ from imu_calibration.kinematics.joint_motion import JointMotion, encoder_step
 from imu_calibration.kinematics.smoothing import (
     Knots,
     PenalisedSpline,
-    Smooth,
     design_matrix,
     design_values,
     evaluate_pieces,
@@ -25,41 +24,21 @@ VELOCITY_LAG = 2e-4
 """Largest lag of used velocities behind the positions, s; late ones imitate a time offset of the IMU."""
 
 
-class JointRows:
-    """Rows of the design at the stamps, for positions and velocities."""
-
-    def __init__(self, knots: Knots, time: np.ndarray):
-        self.knots, self.time = knots, time
-        self._position = self._make(0)
-
-    def _make(self, derivative, weight=None):
-        interval, values = design_values(self.knots, self.time, derivative)
-        if weight is not None:
-            values = values * weight
-        return design_matrix(self.knots, interval, values), normal_bands(self.knots, interval, values)
-
-    def positions(self) -> PenalisedSpline:
-        """Return the least squares of positions only."""
-        return PenalisedSpline(*self._position)
-
-    def both(self, weight: np.ndarray) -> PenalisedSpline:
-        """Return the least squares of positions, and below them velocities times `weight`."""
-        design, bands = self._make(1, weight)
-        return PenalisedSpline(vstack([self._position[0], design], format='csr'), self._position[1] + bands, n_kinds=2)
-
-
-def fit_with_velocity(rows: JointRows, fit: Smooth, position: np.ndarray, *, velocity: np.ndarray, trend: 'Trend') -> Smooth:
+def _with_velocity(spline, fit, position, velocity, *, knots, time, trend):
     """Return the fit to positions and velocities; `fit`, that to the positions, if the velocities disagree or are much noisier."""
     pieces = piece_coefficients(fit.coefficients[:, None])
-    trend.add_to(pieces, rows.knots)
-    _, rate, acceleration = evaluate_pieces(rows.knots, pieces, rows.time, derivatives=2)[:, :, 0]
+    trend.add_to(pieces, knots)
+    _, rate, acceleration = evaluate_pieces(knots, pieces, time, derivatives=2)[:, :, 0]
     trusted, velocity_sd = check_velocity(velocity, rate, acceleration, dof=fit.dof)
     # Information of velocities at the edge of the band, relative to positions.
-    if not trusted or fit.noise_sd * fit.bandwidth / rows.knots.step < 0.3 * velocity_sd:
+    if not trusted or fit.noise_sd * fit.bandwidth / knots.step < 0.3 * velocity_sd:
         return fit
     weight = np.where(np.isfinite(velocity), fit.noise_sd / velocity_sd, 0.0)
-    rest = position - trend.at(rows.time)[:, 0], weight * (np.nan_to_num(velocity) - trend.at(rows.time, 1)[:, 0])
-    better, = smooth(rows.both(weight), np.concatenate(rest)[:, None], [fit.noise_sd])
+    rest = position - trend.at(time)[:, 0], weight * (np.nan_to_num(velocity) - trend.at(time, 1)[:, 0])
+    interval, values = design_values(knots, time, 1)
+    both = PenalisedSpline(vstack([spline.design, design_matrix(knots, interval, values * weight)], format='csr'),
+                           spline.bands + normal_bands(knots, interval, values * weight), n_kinds=2)
+    better, = smooth(both, np.concatenate(rest)[:, None], [fit.noise_sd])
     return better
 
 
@@ -214,12 +193,14 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
     bandwidth, noise = np.zeros(position.shape[1]), floor.copy()
     moving = np.flatnonzero(~still).tolist()
     if len(stamps) >= _MINIMUM_SAMPLES and len(moving):
-        rows = JointRows(knots, time)
-        fits = smooth(rows.positions(), position[:, moving] - trend.at(time)[:, moving], floor[moving])
+        interval, values = design_values(knots, time)
+        spline = PenalisedSpline(design_matrix(knots, interval, values), normal_bands(knots, interval, values))
+        fits = smooth(spline, position[:, moving] - trend.at(time)[:, moving], floor[moving])
         for joint, fit in zip(moving, fits, strict=True):
             noise[joint] = max(floor[joint], fit.noise_sd)
             if velocity is not None:
-                fit = fit_with_velocity(rows, fit, position[:, joint], velocity=velocity[:, joint], trend=trend.column(joint))
+                fit = _with_velocity(spline, fit, position[:, joint], velocity[:, joint], knots=knots, time=time,
+                                     trend=trend.column(joint))
             coefficients[:, joint], bandwidth[joint] = fit.coefficients, fit.bandwidth / (2 * np.pi * knots.step)
     pieces = piece_coefficients(coefficients)
     trend.add_to(pieces, knots)

@@ -73,14 +73,20 @@ def skew(vector: Sequence[float] | np.ndarray) -> np.ndarray:
     return matrix
 
 
+def cross(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the cross products of vectors along the last axis but one, shapes (..., 3, n) and (3, n) or (3, 1)."""
+    (x, y, z), a, b, c = right, left[..., 0, :], left[..., 1, :], left[..., 2, :]
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-2)
+
+
 def lever_matrix(rate_s: np.ndarray, alpha_s: np.ndarray) -> np.ndarray:
     """
     Return W with ``f_point = f_ref + W @ r``: ``W = [alpha x] + [omega x]^2``, shape (n, 3, 3).
 
     Zhang 2017, eq. 11, with the dot on the tangential term that the print lost.
     """
-    cross = skew(rate_s)
-    return skew(alpha_s) + cross @ cross
+    across = skew(rate_s)
+    return skew(alpha_s) + across @ across
 
 
 def rotation(vector: np.ndarray) -> np.ndarray:
@@ -112,9 +118,9 @@ def align(direction: np.ndarray) -> np.ndarray:
     across = x * x + y * y
     if z < 0 and across < 1e-24:
         return np.diag([1.0, -1.0, -1.0])
-    cross = skew([y, -x, 0.0])
+    turn = skew([y, -x, 0.0])
     # 1 + z cancels when z is near -1.
-    return np.eye(3) + cross + cross @ cross / (1 + z if z > 0 else across / (1 - z))
+    return np.eye(3) + turn + turn @ turn / (1 + z if z > 0 else across / (1 - z))
 
 
 EARTH_RATE = 7.292115e-5

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.rotations import Reference, skew
+from imu_calibration.kinematics.rotations import Reference, cross, skew
 
 MAGNUS_SECOND = 1.0 / 12.0
 """Weight of ``dt^2 rate_k x rate_{k+1}`` and of ``-dt^2 (slope_{k+1} - slope_k)`` in the rotation vector of a step."""
@@ -91,19 +91,13 @@ def _rotation_vectors(rate, step, slopes):
     slope = slopes[1] * rate
     slope[:, 1:] += slopes[0][1:] * first
     slope[:, :-1] += slopes[2][:-1] * second
-    return 0.5 * step * (first + second) + MAGNUS_SECOND * step**2 * (_cross(first, second) - np.diff(slope))
-
-
-def _cross(left, right):
-    """Return the cross products of vectors along the last axis but one, shapes (..., 3, n) and (3, n)."""
-    (a, b, c), (x, y, z) = np.moveaxis(left, -2, 0), right
-    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-2)
+    return 0.5 * step * (first + second) + MAGNUS_SECOND * step**2 * (cross(first, second) - np.diff(slope))
 
 
 def small_rotation(vector: np.ndarray) -> np.ndarray:
     """Return the rotation matrix of one rotation vector, to second order in its small length."""
-    cross = skew(vector)
-    return np.eye(3) + cross + 0.5 * cross @ cross
+    turn = skew(vector)
+    return np.eye(3) + turn + 0.5 * turn @ turn
 
 
 def _slope_weights(time):
@@ -126,8 +120,8 @@ def _per_sample(gain, step, rate, slopes):
     """
     half, by_vector = 0.5 * step * gain, MAGNUS_SECOND * step**2 * gain
     weight, by_slope = np.zeros((2, 3, 3, len(step) + 1))
-    weight[..., :-1] = half - _cross(by_vector, rate[:, 1:])
-    weight[..., 1:] += half + _cross(by_vector, rate[:, :-1])
+    weight[..., :-1] = half - cross(by_vector, rate[:, 1:])
+    weight[..., 1:] += half + cross(by_vector, rate[:, :-1])
     by_slope[..., :-1] = by_vector
     by_slope[..., 1:] -= by_vector
     weight += slopes[1] * by_slope
@@ -165,8 +159,8 @@ def _times_jacobian(rows, vectors):
     safe = np.where(small, 1.0, angle)
     one = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
     two = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    across = _cross(rows, vectors)
-    return rows - one * across + two * _cross(across, vectors)
+    across = cross(rows, vectors)
+    return rows - one * across + two * cross(across, vectors)
 
 
 def integrate_attitude(time: np.ndarray, rate_s: np.ndarray, mat_ns0: np.ndarray | None = None) -> np.ndarray:

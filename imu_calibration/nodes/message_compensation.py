@@ -95,12 +95,12 @@ class LiveCompensation(SampleCompensation):
         try:
             frame_id = self._message.open(data)
         except MessageError:
-            self.refuse('not an Imu message')
+            self.counts['not an Imu message'] += 1
             return False
         if self.frame_id and frame_id != self.frame_id:
             self._message.forget()
             known = len(self.counts) < MAX_COUNTED_REASONS or f"frame_id '{frame_id}'" in self.counts
-            self.refuse(f"frame_id '{frame_id}'" if known else 'many further frame_ids')
+            self.counts[f"frame_id '{frame_id}'" if known else 'many further frame_ids'] += 1
             return False
         self._orientation_in = None
         return True

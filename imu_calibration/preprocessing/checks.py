@@ -13,7 +13,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.preprocessing import value_checks
 from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING, CheckFinding, EvidenceGatherer, RecordingEvidence
-from imu_calibration.preprocessing.scan import SENSOR_COLUMNS, FrozenPart, long_runs
+from imu_calibration.preprocessing.scan import SENSOR_COLUMNS, FrozenPart, in_long_runs
 from imu_calibration.preprocessing.stamping import IRREGULAR, MAX_IRREGULAR_SHARE
 from imu_calibration.preprocessing.stream_cleaning import MESSAGES, BlockCleaner, CleanedBlock, StreamStatistics
 
@@ -40,7 +40,7 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         for axis in np.flatnonzero(~constant):
             moving = np.delete(range_[:, part], axis, axis=1) > MIN_MOVING_STEPS * np.delete(evidence.resolution[part], axis)
             same = (range_[:, part][:, axis] == 0) & ~_at_end(chunks.mean[:, part][:, axis], evidence.ends[part][axis])
-            stuck = _in_long_runs(same & moving.any(axis=1)) if noisy[axis] else np.zeros(1, bool)
+            stuck = in_long_runs(same & moving.any(axis=1)) if noisy[axis] else np.zeros(1, bool)
             if stuck.any():
                 seconds = stuck.sum() * float(np.median(chunks.duration))
                 yield CheckFinding('frozen', WARNING,
@@ -51,13 +51,6 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 def _at_end(values, ends):
     """Return which values are clipping limits of an output: clipped, not frozen."""
     return np.logical_or.reduce([np.isclose(values, sign * end.level, rtol=1e-9) & (end.n_clipped > 0) for sign, end in zip((1, -1), ends)])
-
-
-def _in_long_runs(flags):
-    kept = np.zeros(len(flags), bool)
-    for start, end in long_runs(flags):
-        kept[start:end] = True
-    return kept
 
 
 def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:

@@ -13,7 +13,7 @@ from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.rotations import rpy_from_rotation
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import refuse, span_words
-from imu_calibration.preprocessing.on_table import MIN_MATCH, TESTED_RATE, exchanged, find_exchange, match_axes, same_motion, signs_or_delay
+from imu_calibration.preprocessing.on_table import TESTED_RATE, exchanged, find_exchange, match_axes, same_motion, signs_or_delay
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
 from imu_calibration.preprocessing.scan import MIN_TURN_RATE
 from imu_calibration.preprocessing.value_checks import force_error, wrong_rate_unit
@@ -114,6 +114,9 @@ RELATED = 0.5
 """Smallest squared correlation for a check of factors and axes."""
 WORDS = {'accelerometer': ('specific force at rest', 'gravity in the attitudes of the joints'),
          'gyroscope': ('angular rates', 'the rates of the joints')}
+
+
+NO_EXCHANGE = 'no exchange of axes makes them so'
 
 
 class Reduced(Protocol):
@@ -225,13 +228,8 @@ def _axes(sensor, moments, table, windows):
         return
     what, whose = WORDS[sensor]
     yield CheckFinding('handedness', REFUSE,
-                       f'{what} must be {whose}, {_exchange(match, seen)}: {_cause(match, matrix, seen, table)}'
+                       f'{what} must be {whose}, {match.words(seen) or NO_EXCHANGE}: {_cause(match, matrix, seen, table)}'
                        + (f'; or {delay.words}' if delay else ''))
-
-
-def _exchange(match, seen):
-    known = [f"measured {'xyz'[i]} is {'minus ' if sign < 0 else ''}the reference's {'xyz'[j]}" for i, j, sign in match.exchanges(seen)]
-    return ', '.join(known) if known and match.agreement > MIN_MATCH else 'no exchange of axes makes them so'
 
 
 def _cause(match, matrix, seen, table):

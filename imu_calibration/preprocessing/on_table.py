@@ -49,12 +49,16 @@ class AxisMatch:
 
     def exchanges(self, seen: np.ndarray = np.eye(3)) -> list[tuple[int, int, float]]:
         """Return (measured axis, reference axis, sign) of each wrong axis, for the reference axes with motion."""
-        found = []
-        for j in np.flatnonzero(np.diag(seen) > 0.5):
-            i = int(np.argmax(np.abs(self.matrix[:, j])))
-            if i != j or self.matrix[i, j] < 0:
-                found.append((i, int(j), float(self.matrix[i, j])))
-        return sorted(found)
+        return [(i, j, sign) for i, j, sign in _wrong_axes(self.matrix) if seen[j, j] > 0.5]
+
+    def words(self, seen: np.ndarray) -> str:
+        """Return these exchanges in words; '' where no exchange of axes explains the matrix."""
+        return ', '.join(_axis_phrases(self.matrix, seen)) if self.agreement > MIN_MATCH else ''
+
+
+def _wrong_axes(matrix):
+    """Return (row, column, sign) of the entries of a signed permutation that differ from the identity."""
+    return [(int(i), int(j), float(matrix[i, j])) for i, j in np.argwhere(matrix) if i != j or matrix[i, j] < 0]
 
 
 def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:
@@ -179,10 +183,9 @@ def _joint_phrases(names, order, signs):
                  for k, (j, sign) in enumerate(zip(order, signs)) if k != j or sign < 0)
 
 
-def _axis_phrases(axes):
-    where = np.abs(axes).argmax(axis=1)
-    return tuple(f"measured {'xyz'[i]} is {'minus ' if axes[i, j] < 0 else ''}the reference's {'xyz'[j]}"
-                 for i, j in enumerate(where) if i != j or axes[i, j] < 0)
+def _axis_phrases(axes, seen=np.eye(3)):
+    return tuple(f"measured {'xyz'[i]} is {'minus ' if sign < 0 else ''}the reference's {'xyz'[j]}"
+                 for i, j, sign in _wrong_axes(axes) if seen[j, j] > 0.5)
 
 
 MIN_RATE_GAIN = 0.05

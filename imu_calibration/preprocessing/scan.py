@@ -243,6 +243,14 @@ def long_runs(flags: np.ndarray) -> np.ndarray:
     return runs[np.ptp(runs, axis=1) >= LONG]
 
 
+def in_long_runs(flags: np.ndarray) -> np.ndarray:
+    """Return the flags without runs of fewer than `LONG`."""
+    kept = np.zeros(len(flags), bool)
+    for start, stop in long_runs(flags):
+        kept[start:stop] = True
+    return kept
+
+
 def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarray]:
     """
     Return sensor -> which chunks it is frozen in, bool, shape (n,).
@@ -259,18 +267,12 @@ def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarra
 
     """
     flat = {sensor: (chunks.range[:, part] == 0).all(axis=1) for sensor, part in SENSOR_COLUMNS.items()}
-    runs = {sensor: long_runs(flags) for sensor, flags in flat.items()}
-    found = {sensor: np.zeros(len(chunks), bool) for sensor in SENSOR_COLUMNS}
-    if not any(map(len, runs.values())):
-        return found
-    rest = find_rest(chunks.select(~np.logical_or(*flat.values())))
-    if rest is None:
-        return found
+    found = {sensor: in_long_runs(flags) for sensor, flags in flat.items()}
+    rest = find_rest(chunks.select(~np.logical_or(*flat.values()))) if np.logical_or(*found.values()).any() else None
     for sensor, part in SENSOR_COLUMNS.items():
-        noisy = (rest.range[part] >= MIN_NOISE_STEPS * resolution[part]).all() and (rest.range[part] > 0).all()
-        if noisy and len(runs[sensor]) <= len(rest.force):
-            for start, stop in runs[sensor]:
-                found[sensor][start:stop] = True
+        if rest is None or not rest.range[part].all() or (rest.range[part] < MIN_NOISE_STEPS * resolution[part]).any() \
+                or len(runs_of(found[sensor])) > len(rest.force):
+            found[sensor] = np.zeros(len(chunks), bool)
     return found
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, runs_of
+from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch
 from imu_calibration.preprocessing import window_cutter
 from imu_calibration.preprocessing.rest_detection import QUIETNESS_REACH, QuietFloor, quiet_beside_joints
@@ -201,11 +202,12 @@ class MotionChunks:
         motion = np.zeros((4,) + level[core].shape)
         motion[0] = level[core]
         self._draw_curves(motion, time[core], phase[core], runs)
-        warmth = self._warmth(imu.stamp_ns[core], stop_ns + self._margin_ns)
+        temperature, branch = self._warmth(imu.stamp_ns[core], stop_ns + self._margin_ns)
+        vibration = self._vibration.of(period, imu.force_s[core])
         corrected = None if imu.corrected is None else imu.corrected[core]
         return self._without_lost(PhasedSamples(
-            imu.stamp_ns[core], time[core] + self.time_origin, imu.force_s[core], imu.rate_s[core], *motion, *warmth,
-            self._vibration.of(period, imu.force_s[core]), phase[core], quiet[core], after_gap,
+            imu.stamp_ns[core], imu.force_s[core], imu.rate_s[core], JointMotion(time[core] + self.time_origin, *motion, branch, vibration),
+            temperature, phase[core], quiet[core], after_gap,
             np.zeros(len(after_gap), bool), joint_step[core], corrected), self._at_edge(imu.stamp_ns[core], limit, final))
 
     def _joint_runs(self, first_ns, last_ns, period):

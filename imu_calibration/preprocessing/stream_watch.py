@@ -1,5 +1,6 @@
 """State of the streams of a live session from header stamps: rates, silence, dropped samples."""
 
+from collections import Counter
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.preprocessing.stamping import IRREGULAR, StampLine
-from imu_calibration.preprocessing.stream_cleaning import MESSAGES
+from imu_calibration.preprocessing.stream_cleaning import MESSAGES, STREAMS
 from imu_calibration.preprocessing.window_cutter import dropped
 
 SILENT_AFTER = 2.0
@@ -60,16 +61,14 @@ class StreamWatch:
         wanted = {'imu': True, 'joints': joints, 'temperature': temperature}
         after = {'imu': SILENT_AFTER, 'joints': SILENT_AFTER, 'temperature': COLD_AFTER}
         self._needed = {name: after[name] for name, asked in wanted.items() if asked}
-        self._count = {'imu': 0, 'joints': 0, 'temperature': 0}
-        self._newest = {}
-        self._arrived = {}
-        self._period = {}
-        self._lost, self._recent = {}, {}
+        self._count = dict.fromkeys(STREAMS, 0)
+        self._newest, self._arrived, self._period = {}, {}, {}
+        self._lost, self._recent = Counter(), Counter()
         self._lost_at: float | None = None
         self._apart_since: float | None = None
         self._stamping: Any = None
         self._unstamped_at: float | None = None
-        self._notes: dict[str, int] = {}
+        self._notes: Counter[str] = Counter()
 
     @property
     def last_arrival(self) -> float | None:
@@ -78,8 +77,9 @@ class StreamWatch:
 
     def note(self, block: SampleBlock, now: float) -> None:
         """Process a SampleBlock that arrived at `now`, s of a steady clock."""
-        for reason, count in (block.notes or {}).items():
-            self._notes[reason], self._unstamped_at = self._notes.get(reason, 0) + count, now
+        if block.notes:
+            self._notes.update(block.notes)
+            self._unstamped_at = now
         for name in self._count:
             samples = getattr(block, name)
             if samples is None or not len(samples):
@@ -92,9 +92,8 @@ class StreamWatch:
 
     def note_counts(self, counts: dict[str, int], now: float) -> None:
         """Record the counts of samples by their use."""
-        lost = dropped(counts)
-        grown = {reason: count - self._lost.get(reason, 0) for reason, count in lost.items() if count > self._lost.get(reason, 0)}
-        if grown:
+        lost = Counter(dropped(counts))
+        if grown := lost - self._lost:
             self._recent, self._lost_at = grown, now
         self._lost = lost
 

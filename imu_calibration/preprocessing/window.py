@@ -2,7 +2,7 @@
 
 import pickle
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from io import SEEK_END
 from tempfile import SpooledTemporaryFile
@@ -85,26 +85,14 @@ class PhasedSamples(AlignedArrays):
 
     stamp_ns: np.ndarray
     """Header stamps, shape (n,)."""
-    time: np.ndarray
-    """Session time, s, shape (n,)."""
     force_s: np.ndarray
     """Shape (n, 3)."""
     rate_s: np.ndarray
     """Shape (n, 3)."""
-    position: np.ndarray
-    """Joint angles, shape (n, n_joints); the three below are their derivatives, zero where the joints rest."""
-    joint_rate: np.ndarray
-    """Shape (n, n_joints)."""
-    acceleration: np.ndarray
-    """Shape (n, n_joints)."""
-    jerk: np.ndarray
-    """Shape (n, n_joints)."""
+    motion: JointMotion
+    """At session time; derivatives are zero where the joints rest, the thermal branch is NaN where the temperature is unknown."""
     temperature_c: np.ndarray
     """NaN where unknown, shape (n,)."""
-    thermal_branch: np.ndarray
-    """Thermal branch (direction of the temperature change), NaN where it is unknown, shape (n,)."""
-    vibration: np.ndarray
-    """Variance of the vibration (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3)."""
     phase: np.ndarray
     """STILL, STEADY or MOVING, shape (n,)."""
     quiet: np.ndarray
@@ -118,13 +106,18 @@ class PhasedSamples(AlignedArrays):
     corrected: np.ndarray | None = None
     """See `ImuSamples`."""
 
+    @property
+    def time(self) -> np.ndarray:
+        """Session time, s, shape (n,)."""
+        return self.motion.time
+
 
 def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason = UnusedReason.NONE) -> Window:
     """Return the `Window` of a kind that holds all of `samples`."""
-    temperature = None if np.isnan(samples.temperature_c).any() else samples.temperature_c
-    moving = JointMotion(samples.time, samples.position, samples.joint_rate, samples.acceleration, samples.jerk,
-                         None if temperature is None else samples.thermal_branch, samples.vibration)
-    motion = _mean_motion(samples) if kind == WindowKind.STATIC else moving
+    motion, temperature = samples.motion, samples.temperature_c
+    if np.isnan(temperature).any():
+        motion, temperature = replace(motion, thermal_branch=None), None
+    motion = _mean_motion(motion) if kind == WindowKind.STATIC else motion
     return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason,
                   samples.joint_step.max(axis=0), samples.corrected)
 
@@ -174,33 +167,37 @@ def chunks(windows: Iterable[Window]) -> Iterator[list[Window]]:
         yield part
 
 
+def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None]:
+    """Return the motion of all windows in one piece, and the temperatures (window means where static), or None."""
+    known = [[w.temperature_c.mean()] if w.kind == WindowKind.STATIC else w.temperature_c for w in windows if w.temperature_c is not None]
+    temperatures = np.concatenate(known) if len(known) == len(windows) else None
+    if len(windows) == 1:
+        return windows[0].motion, temperatures
+    return JointMotion.concatenate(window.motion for window in windows), temperatures
+
+
 def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None, np.ndarray]:
-    """Return the motion of all windows, their temperatures or None, and for each sample the row of the motion that belongs to it."""
-    motion = JointMotion.concatenate(window.motion for window in windows)
+    """Return the result of `joined_motion`, and for each sample the row of the motion that belongs to it."""
     lengths = [len(w.motion) for w in windows]
     starts = np.cumsum([0] + lengths)
     rows = np.concatenate([np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
                            for w, s, n in zip(windows, starts, lengths)])
-    known = [(w.temperature_c, n) for w, n in zip(windows, lengths) if w.temperature_c is not None]
-    if len(known) < len(windows):
-        return motion, None, rows
-    parts = [warm if n == len(warm) else np.full(n, warm.mean()) for warm, n in known]
-    return motion, np.concatenate(parts), rows
+    return *joined_motion(windows), rows
 
 
-def _mean_motion(samples):
+def _mean_motion(motion):
     """Return one row: the mean position and, when the slope of a straight line is significant, this slope."""
-    mean = samples.position.mean(axis=0)
-    some = slice(None, None, max(1, len(samples) // 500))  # the levels are averages over 0.2 s, so these contain the same information
-    time, position = samples.time[some] - samples.time[some].mean(), samples.position[some] - mean
+    mean = motion.position.mean(axis=0)
+    some = slice(None, None, max(1, len(motion) // 500))  # the levels are averages over 0.2 s, so these contain the same information
+    time, position = motion.time[some] - motion.time[some].mean(), motion.position[some] - mean
     slope = time @ position / max(time @ time, 1e-12)
     rest = (position - time[:, None] * slope).std(axis=0)
     distance = np.abs(slope) * (time[-1] - time[0])
     # one encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no creep
     slope = np.where((distance > 8 * rest) & (distance > 1e-6), slope, 0.0)
-    zero, branch = np.zeros((1, len(mean))), samples.thermal_branch.mean(keepdims=True)
-    return JointMotion(samples.time.mean(keepdims=True), mean[None], slope[None], zero, zero, None if np.isnan(branch).any() else branch,
-                       samples.vibration.mean(axis=0, keepdims=True))
+    zero, branch = np.zeros((1, len(mean))), motion.thermal_branch
+    return JointMotion(motion.time.mean(keepdims=True), mean[None], slope[None], zero, zero,
+                       None if branch is None else branch.mean(keepdims=True), motion.vibration.mean(axis=0, keepdims=True))
 
 
 @dataclass(frozen=True)
