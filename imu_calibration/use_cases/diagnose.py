@@ -76,10 +76,10 @@ class Diagnosed:
             files.write_text(place / 'extended.yaml', calibration_to_text(self.proposed))
 
     def save_overlay(self, path: str | PathLike) -> None:
-        """Write measured and simulated signals, residuals, spectra and histograms as MCAP for Foxglove (`overlay_bytes`)."""
-        from imu_calibration.use_cases.view import overlay_bytes
+        """Write measured and simulated signals, residuals, spectra and histograms as MCAP for Foxglove (`overlay_topics`)."""
+        from imu_calibration.use_cases.view import mcap_bytes, overlay_topics
         diagnosis = self.result.diagnosis
-        files.write_whole(path, overlay_bytes(diagnosis.traces, diagnosis.baseline.model.joint_names))
+        files.write_whole(path, mcap_bytes(overlay_topics(diagnosis.traces, diagnosis.baseline.model.joint_names)))
 
     def __str__(self):
         return '\n'.join(self.result.lines)

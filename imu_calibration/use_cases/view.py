@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
 from os import PathLike
@@ -48,27 +48,6 @@ PARAMETERS_TOPIC, SPHERE_TOPIC = '/imu/parameters', '/imu/coverage'
 RESIDUAL_TOPIC, SPECTRUM_TOPIC = '/imu/residual/windows', '/imu/residual/spectrum'
 BAND = 1.959964
 """Standard deviations on each side of a value that hold 95 %."""
-NUMBER, TEXT = {'type': 'number'}, {'type': 'string'}
-
-
-def _object(**properties):
-    return {'type': 'object', 'properties': properties}
-
-
-def _list(**properties):
-    return {'type': 'array', 'items': _object(**properties)}
-
-
-XYZ = _object(x=NUMBER, y=NUMBER, z=NUMBER)
-SENSOR_AXES = _object(accelerometer=XYZ, gyroscope=XYZ)
-SCHEMAS = {
-    PARAMETERS_TOPIC: {'title': 'imu_calibration.Parameters', **_object(parameters=_list(
-        name=TEXT, value=NUMBER, sd=NUMBER, low=NUMBER, high=NUMBER, unit=TEXT, tolerance=NUMBER, ratio=NUMBER, status=TEXT))},
-    RESIDUAL_TOPIC: {'title': 'imu_calibration.Residual', **_object(windows=_list(
-        time=NUMBER, motion=TEXT, before=SENSOR_AXES, after=SENSOR_AXES, floor=SENSOR_AXES))},
-    SPECTRUM_TOPIC: {'title': 'imu_calibration.Spectrum', **_object(lines=_list(frequency=NUMBER, accelerometer=XYZ, gyroscope=XYZ))},
-}
-"""Topic -> JSON schema; SI units, times in s since the first sample."""
 
 
 def parameters(calibration: Calibration, tolerances: np.ndarray) -> dict[str, Any]:
@@ -170,39 +149,42 @@ def foxglove() -> Any:
     return foxglove
 
 
-def foxglove_bytes(contents: Mapping[str, dict[str, Any]], coverage: Coverage | None, frame_id: str, *, seconds: float = 0.0) -> bytes:
+def mcap_bytes(topics: Iterable[tuple[str, Sequence[tuple[float, Any]]]]) -> bytes:
     """
-    Return an MCAP with the same messages at its beginning and at its end: they are visible at any playback time.
+    Return an MCAP of topics with their messages; a topic of plain data has the JSON schema of its first message.
 
     Parameters
     ----------
-    contents : mapping
-        Topic of `SCHEMAS` -> content.
-    coverage : Coverage or None
-        The sphere.
-    frame_id : str
-        Frame of the sphere.
-    seconds : float
-        Length of the recording.
+    topics : iterable of (topic, messages)
+        Each message with its log time, s since the first sample; a SceneUpdate, or plain data in SI units.
+
+    Raises
+    ------
+    InputError
+        When foxglove-sdk is not installed.
 
     """
     sdk, whole = foxglove(), BytesIO()
     context = sdk.Context()
     with sdk.open_mcap(whole, context=context):
-        shown = [(channel_of(sdk, topic, context), content) for topic, content in contents.items()]
-        if coverage is not None:
-            shown.append((channel_of(sdk, SPHERE_TOPIC, context), scene_of(coverage, frame_id)))
-        for time in (0.0, max(seconds, MIN_FILE_SECONDS)):
-            for channel, content in shown:
+        for topic, messages in topics:
+            if isinstance(first := messages[0][1], dict):
+                channel = sdk.Channel(topic, schema={'title': topic.strip('/').replace('/', '.'), **_schema(first)},
+                                      message_encoding='json', context=context)
+            else:
+                channel = sdk.channels.SceneUpdateChannel(topic, context=context)
+            for time, content in messages:
                 channel.log(content, log_time=round(1e9 * time))
     return whole.getvalue()
 
 
-def channel_of(sdk: Any, topic: str, context: Any) -> Any:
-    """Return a channel of a topic in a context of foxglove-sdk."""
-    if topic == SPHERE_TOPIC:
-        return sdk.channels.SceneUpdateChannel(topic, context=context)
-    return sdk.Channel(topic, schema=SCHEMAS[topic], message_encoding='json', context=context)
+def _schema(content: Any) -> dict[str, Any]:
+    """Return the JSON schema of a content."""
+    if isinstance(content, dict):
+        return {'type': 'object', 'properties': {name: _schema(value) for name, value in content.items()}}
+    if isinstance(content, list):
+        return {'type': 'array', 'items': _schema(next(iter(content), 0.0))}
+    return {'type': 'string' if isinstance(content, str) else 'number'}
 
 
 def scene_of(coverage: Coverage, frame_id: str) -> Any:
@@ -244,33 +226,14 @@ def _from_x(along):
 OVERLAY, OVERLAY_RESIDUAL, OVERLAY_SPECTRUM, HISTOGRAM = '/overlay', '/residual', '/residual_spectrum', '/residual_histogram'
 
 
-def overlay_bytes(traces: Traces, joint_names: Sequence[str]) -> bytes:
+def overlay_topics(traces: Traces, joint_names: Sequence[str]) -> Iterator[tuple[str, list[tuple[float, Any]]]]:
     """
-    Return the MCAP; SI units, log times in s since the first sample.
+    Yield the topics of `mcap_bytes` for a diagnosis.
 
     ``/overlay/SENSOR/AXIS`` has measured, simulated_before and simulated_after on the segment with the largest difference;
     ``/residual/SENSOR`` the residual before and after with time, force, rate, angles and temperature; ``/residual_spectrum/SENSOR`` and
     ``/residual_histogram/SENSOR/AXIS`` arrays of the same length.
-
-    Raises
-    ------
-    InputError
-        When foxglove-sdk is not installed.
-
     """
-    sdk, whole = foxglove(), BytesIO()
-    context = sdk.Context()
-    with sdk.open_mcap(whole, context=context):
-        for topic, messages in _topics(traces, joint_names):
-            channel = sdk.Channel(topic, schema={'title': topic.strip('/').replace('/', '.'), **_schema(messages[0][1])},
-                                  message_encoding='json', context=context)
-            for time, content in messages:
-                channel.log(content, log_time=round(1e9 * time))
-    return whole.getvalue()
-
-
-def _topics(traces, joint_names):
-    """Yield (topic, [(time, content)])."""
     end = float(traces.time[-1])
     for sensor in SENSORS:
         for axis, segment in zip(AXES, traces.segments.get(sensor, ())):
@@ -300,13 +263,6 @@ def _by_axis(values):
     return dict(zip(AXES, values.T.tolist()))
 
 
-def _schema(content: Any) -> dict[str, Any]:
-    """Return the JSON schema of a content."""
-    if isinstance(content, dict):
-        return {'type': 'object', 'properties': {name: _schema(value) for name, value in content.items()}}
-    return {'type': 'array', 'items': {'type': 'number'}} if isinstance(content, list) else {'type': 'number'}
-
-
 @dataclass(frozen=True, eq=False)
 class View:
     """View of a calibration."""
@@ -314,7 +270,7 @@ class View:
     calibration: Calibration
     """The calibration."""
     contents: dict[str, dict[str, Any]]
-    """Topic -> content, as in `SCHEMAS`."""
+    """Topic -> content, SI units."""
     coverage: Coverage | None
     """The sphere; None where only a file is known."""
     seconds: float = 0.0
@@ -344,7 +300,11 @@ class View:
             When foxglove-sdk is not installed or the place cannot be written.
 
         """
-        files.write_whole(path, foxglove_bytes(self.contents, self.coverage, self.calibration.frame_id or 'imu_link', seconds=self.seconds))
+        shown: dict[str, Any] = dict(self.contents)
+        if self.coverage is not None:
+            shown[SPHERE_TOPIC] = scene_of(self.coverage, self.calibration.frame_id or 'imu_link')
+        times = (0.0, max(self.seconds, MIN_FILE_SECONDS))   # visible at any playback time
+        files.write_whole(path, mcap_bytes((topic, [(time, content) for time in times]) for topic, content in shown.items()))
 
 
 def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]) -> View:
