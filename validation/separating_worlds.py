@@ -14,6 +14,7 @@ import time
 from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count, islice
 
 import numpy as np
@@ -55,13 +56,12 @@ class World:
         """Return the first motion: the six faces, a spin in one sense and at one speed about each axis, a swing."""
         rng, builder = generator(self.seed, 'round'), MotionBuilder(3)
         builder.rest(5.0)
-        tasks = [(pose, (up + rng.normal(0.0, 0.03, 3), rng.uniform(-180, 180)), {'dwell': 2.6}) for up in FACES]
+        tasks = [pose(up + rng.normal(0.0, 0.03, 3), rng.uniform(-180, 180), 2.6) for up in FACES]
         speed = rng.choice([-1.0, 1.0]) * rng.uniform(60, 180)
-        tasks += [(_spin_one_way, (up, speed), {}) for up in np.eye(3)]
-        tasks += [(swing, (int(rng.integers(3)), 15.0), {'frequency': rng.uniform(0.5, 1.0), 'duration': 4.0})]
+        tasks += [partial(_spin_one_way, up=up, speed=speed) for up in np.eye(3)]
+        tasks += [swing(int(rng.integers(3)), 15.0, rng.uniform(0.5, 1.0), duration=4.0)]
         for place in rng.permutation(len(tasks)):
-            task, arguments, named = tasks[place]
-            task(builder, *arguments, **named)
+            tasks[place](builder)
         builder.move([0.0, 0.0, 0.0])
         builder.rest(4.0)
         return Profile('round', tuple(builder.segments), ('outer', 'middle', 'inner'))

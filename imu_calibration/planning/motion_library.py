@@ -63,9 +63,7 @@ class PlannedMotion:
 
     def travel(self, position: np.ndarray) -> tuple[Segment, ...]:
         """Return the way from where the joints are to the place of the motion: one move, or none."""
-        builder = MotionBuilder(len(self.place), limits=self.limits, start=position)
-        builder.move_to(self.place)
-        return tuple(builder.segments)
+        return MotionBuilder(len(self.place), limits=self.limits, start=position).move_to(self.place).segments
 
     def from_position(self, position: np.ndarray) -> tuple[Segment, ...]:
         """Return all segments from the present position, with whole turns of endless joints unchanged."""
@@ -220,9 +218,7 @@ class MotionLibrary:
         for place in self.spread:
             yield MotionKind.MOVE, place, (), ''
             for dwell in DWELLS:
-                builder = self._builder(place)
-                builder.rest(dwell)
-                yield MotionKind.POSE, place, tuple(builder.segments), f'rest for {dwell:g} s'
+                yield MotionKind.POSE, place, self._builder(place).rest(dwell).segments, f'rest for {dwell:g} s'
 
     def _spins(self):
         moving = np.flatnonzero(self.limits.turns & (self.limits.upper > self.limits.lower))
@@ -305,31 +301,25 @@ class MotionLibrary:
         return 1.0 + (0.96 * (self.limits.upper[joint] - self.limits.lower[joint]) - reached) / np.abs(rates[0, joint])
 
     def _spun(self, place, rates, seconds) -> tuple[Segment, ...]:
-        builder = self._builder(place)
-        builder.spin(np.degrees(rates), seconds)
-        return tuple(builder.segments)
+        return self._builder(place).spin(np.degrees(rates), seconds).segments
 
     def _swing(self, place, shares, frequency, seconds):
         """Swing with the largest amplitude within range, speed and acceleration."""
         frequency = np.broadcast_to(frequency, place.shape).astype(float)
         unit = np.where(shares, 1.0, 0.0)
-        builder = self._builder(np.zeros(len(place)))
-        builder.swing(unit, frequency, seconds)
-        motion = motion_at(tuple(builder.segments), np.linspace(0.0, seconds, int(60 * seconds)))
+        swung = self._builder(np.zeros(len(place))).swing(unit, frequency, seconds).segments
+        motion = motion_at(swung, np.linspace(0.0, seconds, int(60 * seconds)))
         most = [np.maximum(np.abs(values).max(axis=0), 1e-9) for values in (motion.position, motion.rate, motion.acceleration)]
         lower, upper = reachable(self.limits)
         room = np.where(self.limits.endless, np.inf, 0.48 * (upper - lower))
         reach = [room / most[0], self.limits.speed / most[1], self.limits.acceleration / most[2],
                  np.array([MAX_SWING[bool(turning)] for turning in self.limits.turns])]
-        largest = unit * np.minimum.reduce(reach)
-        amplitude = 0.99 * largest   # the largest values are between the instants of `motion`
+        amplitude = 0.99 * unit * np.minimum.reduce(reach)   # the largest values are between the instants of `motion`
         middle = np.where(self.limits.endless | (unit == 0), place, 0.5 * (lower + upper))
-        builder = self._builder(middle)
-        builder.swing(amplitude, frequency, seconds)
         far = ', '.join(f'{name} by {value:.0f}° at {hertz:.2g} Hz' if turning else f'{name} by {1000 * size:.0f} mm at {hertz:.2g} Hz'
                         for name, size, value, hertz, turning, on in
                         zip(self.names, amplitude, np.degrees(amplitude), frequency, self.limits.turns, unit, strict=True) if on)
-        return middle, tuple(builder.segments), f'swing {far} for {seconds:g} s'
+        return middle, self._builder(middle).swing(amplitude, frequency, seconds).segments, f'swing {far} for {seconds:g} s'
 
     def _rate_words(self, rates: Sequence[float]) -> str:
         return ' and '.join(f'{name} at {np.degrees(rate):+.0f} deg/s' for name, rate in zip(self.names, rates, strict=True) if rate)

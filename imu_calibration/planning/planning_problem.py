@@ -88,13 +88,9 @@ class PlanningProblem:
     @cached_property
     def ways(self) -> dict[tuple[int, int], tuple[Segment, ...]]:
         """(place, place) -> the move from one to the other."""
-        places, found = self.library.places, {}
-        for a, start in enumerate(places):
-            for b, end in enumerate(places):
-                builder = MotionBuilder(len(start), limits=self.library.limits, start=start)
-                builder.move_to(end)
-                found[a, b] = tuple(builder.segments)
-        return found
+        places = self.library.places
+        return {(a, b): MotionBuilder(len(start), limits=self.library.limits, start=start).move_to(end).segments
+                for a, start in enumerate(places) for b, end in enumerate(places)}
 
     @cached_property
     def way_windows(self) -> dict[tuple[int, int], list[PlannedWindow]]:

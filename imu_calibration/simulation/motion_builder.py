@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -163,7 +164,8 @@ class MotionBuilder:
     """
     Writes segments one after the other, each starting where the last one ended.
 
-    Angles are in degrees here, in radians in the segments. For sliding joints, use the methods with SI units.
+    Angles are in degrees here, in radians in the segments. For sliding joints, use the methods with SI units. Each method returns the
+    builder, so that calls can be chained.
     """
 
     def __init__(self, n_joints: int, dwell: float = 1.0, limits: MotionLimits | None = None, *, start: np.ndarray | None = None):
@@ -172,7 +174,7 @@ class MotionBuilder:
 
         `dwell` stretches rests, spins and oscillations, the limits (`MotionLimits`) time moves and ramps.
         """
-        self.segments: list[Segment] = []
+        self.segments: tuple[Segment, ...] = ()
         self.dwell = dwell
         self.limits = limits or free_limits(n_joints)
         self.home = np.clip(np.zeros(n_joints), self.limits.lower, self.limits.upper)
@@ -183,58 +185,62 @@ class MotionBuilder:
         """Number of joints."""
         return len(self._position)
 
-    def rest(self, duration: float) -> None:
+    def rest(self, duration: float) -> Self:
         """Rest for `duration` times dwell, s."""
-        self._append('rest', duration * self.dwell)
+        return self._append('rest', duration * self.dwell)
 
-    def move(self, angles_deg: ArrayLike, shortest: bool = True) -> None:
+    def rest_at_home(self, duration: float) -> Self:
+        """Rest at zero, or at the nearest position within the limits."""
+        return self.move_to(self.home).rest(duration)
+
+    def move(self, angles_deg: ArrayLike, shortest: bool = True) -> Self:
         """Move to the joint angles (NaN: do not move that joint), each by less than half a turn when `shortest`."""
-        self.move_to(np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints)), shortest)
+        return self.move_to(np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints)), shortest)
 
-    def move_to(self, target: np.ndarray, shortest: bool = True) -> None:
+    def move_to(self, target: np.ndarray, shortest: bool = True) -> Self:
         """Move to joint positions in rad and m; endless joints by less than half a turn when `shortest`."""
         shift = np.where(np.isnan(target), 0.0, target - self._position)
         if shortest:
             shift = np.where(self.limits.endless, (shift + np.pi) % (2.0 * np.pi) - np.pi, shift)
         distance = np.abs(shift)
-        if np.max(distance) < 1e-9:
-            return
-        self._append('move', move_time(distance, self.limits), shift=shift)
+        return self if np.max(distance) < 1e-9 else self._append('move', move_time(distance, self.limits), shift=shift)
 
-    def spin(self, rates_deg: ArrayLike, duration: float) -> None:
+    def spin(self, rates_deg: ArrayLike, duration: float) -> Self:
         """Turn at each of the constant rates in `rates_deg`, shape (n_rates, n_joints), for `duration` times dwell, then stop."""
         last = np.zeros(self.n_joints)
         for rate in np.radians(np.atleast_2d(np.asarray(rates_deg, float))):
             self._ramp(last, rate)
             self._append('spin', duration * self.dwell, rate, rate)
             last = rate
-        self._ramp(last, np.zeros(self.n_joints))
+        return self._ramp(last, np.zeros(self.n_joints))
 
     def oscillate(self, amplitude_deg: ArrayLike, frequency: ArrayLike, duration: float, *,
-                  phase: ArrayLike = 0.0, fade: float | None = None) -> None:
+                  phase: ArrayLike = 0.0, fade: float | None = None) -> Self:
         """Swing every joint by sums of sines, arrays of shape (n_sines, n_joints) or (n_joints,), for `duration` times dwell."""
-        self.swing(np.radians(amplitude_deg), frequency, duration, phase=phase, fade=fade)
+        return self.swing(np.radians(amplitude_deg), frequency, duration, phase=phase, fade=fade)
 
     def swing(self, amplitude: np.ndarray, frequency: ArrayLike, duration: float, *, phase: ArrayLike = 0.0,
-              fade: float | None = None) -> None:
+              fade: float | None = None) -> Self:
         """Do the same with amplitudes in rad and m."""
         amplitude = np.atleast_2d(np.asarray(amplitude, float))
         frequency, phase = (np.broadcast_to(np.asarray(value, float), amplitude.shape) for value in (frequency, phase))
         duration = duration * self.dwell
         fade = min(0.5 * duration, 1.0 / np.min(frequency[amplitude != 0.0]) if fade is None else fade)
-        self._append('oscillation', duration, amplitude=amplitude, frequency=frequency, phase=phase, fade=fade)
+        return self._append('oscillation', duration, amplitude=amplitude, frequency=frequency, phase=phase, fade=fade)
 
     def _ramp(self, rate_from, rate_to):
         change = np.max(np.abs(rate_to - rate_from) / self.limits.acceleration)
-        if change > 0.0:
-            self._append('ramp', max(SHORTEST_MOVE, PEAK_ACCELERATION_OF_RAMP * change), rate_from, rate_to)
+        if change == 0.0:
+            return self
+        return self._append('ramp', max(SHORTEST_MOVE, PEAK_ACCELERATION_OF_RAMP * change), rate_from, rate_to)
 
     def _append(self, kind, duration, rate_from=None, rate_to=None, shift=None, **sines):
         zero = np.zeros(self.n_joints)
         parts = [zero if part is None else part for part in (rate_from, rate_to, shift)]
         segment = Segment(kind, float(duration), self._position, *parts, **sines)
-        self.segments.append(segment)
+        self.segments += (segment,)
         self._position = segment.end
+        return self
 
 
 def move_time(distance: np.ndarray, limits: MotionLimits) -> float:
@@ -243,7 +249,7 @@ def move_time(distance: np.ndarray, limits: MotionLimits) -> float:
     return float(max(SHORTEST_MOVE, rate, np.sqrt(np.max(PEAK_ACCELERATION_OF_MOVE * distance / limits.acceleration))))
 
 
-def stretch(build: Callable, duration: float) -> list[Segment]:
+def stretch(build: Callable, duration: float) -> tuple[Segment, ...]:
     """
     Return the segments of `build(dwell)` with the dwell that makes them last `duration` seconds.
 

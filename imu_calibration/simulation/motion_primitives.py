@@ -11,6 +11,8 @@ from imu_calibration.simulation.motion_builder import MotionBuilder
 
 GOLDEN_ANGLE_DEG = 137.50776
 FACES = np.concatenate([np.eye(3), -np.eye(3)])
+Task = Callable[[MotionBuilder], object]
+"""Part of a session: appends segments to a builder."""
 
 
 def pose_deg(up_b: np.ndarray, heading_deg: float = 0.0) -> np.ndarray:
@@ -24,77 +26,66 @@ def pose_deg(up_b: np.ndarray, heading_deg: float = 0.0) -> np.ndarray:
     return np.array([heading_deg, *np.degrees([-np.arcsin(np.clip(x, -1, 1)), inner])])
 
 
-def pose(builder: MotionBuilder, up_b: np.ndarray, heading_deg: float, *, dwell: float) -> None:
+def pose(up_b: np.ndarray, heading_deg: float, dwell: float) -> Task:
     """Rest with `up_b` vertical."""
-    builder.move(pose_deg(up_b, heading_deg))
-    builder.rest(dwell)
+    return lambda builder: builder.move(pose_deg(up_b, heading_deg)).rest(dwell)
 
 
-def spin_vertical(builder: MotionBuilder, up_b: np.ndarray, speeds_deg: ArrayLike, *, dwell: float) -> None:
+def spin_vertical(up_b: np.ndarray, speeds_deg: ArrayLike, dwell: float) -> Task:
     """Turn the outer joint both ways with `up_b` vertical: the body turns about `up_b` and gravity is constant in it."""
-    builder.move(pose_deg(up_b, np.nan))
-    builder.spin([[sense * speed, 0.0, 0.0] for speed in np.atleast_1d(speeds_deg) for sense in (1, -1)], dwell)
+    return spin_joint(0, pose_deg(up_b, np.nan), speeds_deg, dwell=dwell)
 
 
-def spin_joint(builder: MotionBuilder, joint: int, at_deg: ArrayLike, *, speeds_deg: ArrayLike, dwell: float) -> None:
+def spin_joint(joint: int, at_deg: ArrayLike, speeds_deg: ArrayLike, *, dwell: float) -> Task:
     """Turn one joint both ways at each speed."""
-    builder.move(at_deg)
-    rates = np.zeros((2 * len(np.atleast_1d(speeds_deg)), builder.n_joints))
-    rates[:, joint] = [sense * speed for speed in np.atleast_1d(speeds_deg) for sense in (1, -1)]
-    builder.spin(rates, dwell)
+    rates_deg = np.outer(np.atleast_1d(speeds_deg), (1, -1)).ravel()
+    return lambda builder: builder.move(at_deg).spin(np.outer(rates_deg, np.arange(builder.n_joints) == joint), dwell)
 
 
-def swing(builder: MotionBuilder, axis: int, amplitude_deg: float, *, frequency: float, duration: float) -> None:
+def swing(axis: int, amplitude_deg: float, frequency: float, *, duration: float) -> Task:
     """Swing about sensor axis 0, 1 or 2: the inner joint, the middle one, or the middle one with the inner a quarter turn on."""
-    builder.move([[0, 0, 0], [0, 0, 0], [0, 0, 90]][axis])
-    builder.rest(1.0)
-    builder.oscillate([[0, 0, amplitude_deg], [0, amplitude_deg, 0], [0, amplitude_deg, 0]][axis], frequency, duration)
-    builder.rest(1.0)
+    at_deg, joint = (([0, 0, 0], 2), ([0, 0, 0], 1), ([0, 0, 90], 1))[axis]
+    return swing_at(np.radians(at_deg), np.radians(amplitude_deg * np.eye(3)[joint]), frequency, duration=duration)
 
 
-def two_axes(builder: MotionBuilder, at_deg: Sequence[float], rates_deg: ArrayLike, *, dwell: float) -> None:
+def swing_at(position: np.ndarray, amplitude: np.ndarray, frequency: ArrayLike, *, duration: float, settle: bool = True) -> Task:
+    """Swing about joint positions (rad, m), with a rest before and, to `settle`, after it."""
+    def task(builder):
+        builder.move_to(position).rest(1.0).swing(amplitude, frequency, duration)
+        if settle:
+            builder.rest(1.0)
+    return task
+
+
+def two_axes(at_deg: Sequence[float] | np.ndarray, rates_deg: ArrayLike, dwell: float) -> Task:
     """Turn two joints at once, then both the other way, so that a delay cannot pass for an arm."""
-    builder.move(at_deg)
-    builder.spin(np.multiply.outer((1, -1), rates_deg), dwell)
+    return lambda builder: builder.move(at_deg).spin(np.multiply.outer((1, -1), rates_deg), dwell)
 
 
-def tumble(builder: MotionBuilder, amplitude_deg: ArrayLike, frequency: ArrayLike, *, duration: float) -> None:
-    """Swing all joints at once from zero."""
-    builder.move([0, 0, 0])
-    builder.oscillate(amplitude_deg, frequency, duration, phase=[0.3, 1.1, 2.0], fade=2.0)
-
-
-def rest_at_zero(builder: MotionBuilder, dwell: float) -> None:
-    """Rest at the reference pose: zero, or the nearest pose within the limits."""
-    builder.move_to(builder.home)
-    builder.rest(dwell)
-
-
-def run(builder: MotionBuilder, rng: np.random.Generator, tasks: Sequence[Callable], *, reference_every: int = 12) -> None:
+def run(builder: MotionBuilder, rng: np.random.Generator, tasks: Sequence[Task], *, reference_every: int = 12) -> None:
     """Run tasks in a random order, with returns to the reference pose, so that drift is separable from other effects."""
-    rest_at_zero(builder, 8.0)
+    builder.rest_at_home(8.0)
     for count, index in enumerate(rng.permutation(len(tasks)), start=1):
         tasks[index](builder)
         if count % reference_every == 0:
-            rest_at_zero(builder, 5.0)
-    rest_at_zero(builder, 6.0)
+            builder.rest_at_home(5.0)
+    builder.rest_at_home(6.0)
 
 
-def poses(directions: Sequence[np.ndarray] | np.ndarray, dwell: float) -> list[Callable]:
+def poses(directions: Sequence[np.ndarray] | np.ndarray, dwell: float) -> list[Task]:
     """Return the tasks of resting with each direction vertical, at headings spread by the golden angle."""
-    return [partial(pose, up_b=up_b, heading_deg=GOLDEN_ANGLE_DEG * k, dwell=dwell) for k, up_b in enumerate(directions)]
+    return [pose(up_b, GOLDEN_ANGLE_DEG * k, dwell) for k, up_b in enumerate(directions)]
 
 
-def swings(amplitudes_and_frequencies: tuple[tuple[float, float], ...], duration: float) -> list[Callable]:
+def swings(amplitudes_and_frequencies: tuple[tuple[float, float], ...], duration: float) -> list[Task]:
     """Return the tasks of swinging about each sensor axis at each amplitude (deg) and frequency (Hz)."""
-    return [partial(swing, axis=axis, amplitude_deg=amplitude, frequency=frequency, duration=duration)
-            for axis in range(3) for amplitude, frequency in amplitudes_and_frequencies]
+    return [swing(axis, *cycle, duration=duration) for axis in range(3) for cycle in amplitudes_and_frequencies]
 
 
-def simultaneous(speeds_deg: tuple[float, float] | np.ndarray, dwell: float) -> list[Callable]:
+def simultaneous(speeds_deg: tuple[float, float] | np.ndarray, dwell: float) -> list[Task]:
     """Outer and inner, outer and middle (about y, about z), middle and inner: turns about two axes at a time."""
     a, b = speeds_deg
-    return [partial(two_axes, at_deg=at, rates_deg=rates, dwell=dwell) for at, rates in (
+    return [two_axes(at, rates, dwell) for at, rates in (
         ([0, 0, 0], [a, 0, b]), ([0, 0, 0], [a, b, 0]), ([0, 0, 90], [a, -b, 0]), ([0, 45, 0], [a, 0, -b]), ([0, 0, 30], [0, b, a]))]
 
 
@@ -128,31 +119,25 @@ def _equal_angles(builder, _rng):
     """All gimbals at the same angle, 41 positions (averaging of 30...60 s is shortened; `duration` stretches it)."""
     builder.rest(5.0)
     for angle in EQUAL_ANGLES_DEG:
-        builder.move(np.full(builder.n_joints, angle), shortest=False)
-        builder.rest(5.0)
+        builder.move(np.full(builder.n_joints, angle), shortest=False).rest(5.0)
 
 
 def _body_rates(builder, _rng, sample):
     """Each row as one turn of the vertical joint: the inner two hold the wanted direction of the rate upright."""
     for rates in avrutov_rates_deg(sample):
         speed = np.linalg.norm(rates)
-        builder.move(pose_deg(rates if speed else [0, 0, 1], np.nan))
-        builder.rest(2.0)
-        builder.spin([[speed, 0.0, 0.0]], 10.0)
+        builder.move(pose_deg(rates if speed else [0, 0, 1], np.nan)).rest(2.0).spin([[speed, 0.0, 0.0]], 10.0)
 
 
 def _gimbal_rates(builder, _rng, sample):
     """Each row commanded to the three gimbals (x inner, z outer): the body rates are not the gimbal rates."""
     for x, y, z in avrutov_rates_deg(sample):
-        builder.move([0.0, 0.0, 0.0])
-        builder.rest(2.0)
-        builder.spin([[z, y, x]], 30.0)
+        builder.move([0.0, 0.0, 0.0]).rest(2.0).spin([[z, y, x]], 30.0)
 
 
 def _six_faces(builder):
     for face in FACES:
-        builder.move(pose_deg(face))
-        builder.rest(10.0)
+        pose(face, 0.0, 10.0)(builder)
 
 
 def _zhang_spins(builder, _rng):
@@ -167,17 +152,15 @@ def _zhang_oscillations(builder, _rng):
     _six_faces(builder)
     for axis in range(3):
         for amplitude, frequency in ((10.0, 1.0), (5.0, 2.0), (90.0, 0.5)):
-            swing(builder, axis, amplitude, frequency=frequency, duration=12.0)
+            swing(axis, amplitude, frequency, duration=12.0)(builder)
 
 
 def _zhang_mixed(builder, _rng):
     _six_faces(builder)
-    for axis in np.eye(3):
-        spin_vertical(builder, axis, [200.0], dwell=6.0)
-    for axis in range(3):
-        swing(builder, axis, 10.0, frequency=1.0, duration=12.0)
-    for at_deg, rates in (([0, 0, 0], [200, 0, 200]), ([0, 0, 0], [200, 200, 0]), ([0, 0, 90], [200, 200, 0])):
-        two_axes(builder, at_deg, rates, dwell=6.0)
+    tasks = [spin_vertical(axis, 200.0, 6.0) for axis in np.eye(3)] + swings(((10.0, 1.0),), 12.0)
+    for task in [*tasks, *(two_axes(at_deg, rates, 6.0) for at_deg, rates in (
+            ([0, 0, 0], [200, 0, 200]), ([0, 0, 0], [200, 200, 0]), ([0, 0, 90], [200, 200, 0])))]:
+        task(builder)
 
 
 SKEW_60_RPY_DEG = Rotation.from_rotvec(np.pi / 3 * np.ones(3) / np.sqrt(3)).as_euler('xyz', degrees=True).tolist()

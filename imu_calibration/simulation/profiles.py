@@ -15,12 +15,12 @@ from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, st
 from imu_calibration.simulation.motion_primitives import (
     FACES,
     poses,
-    rest_at_zero,
     run,
     simultaneous,
     spin_joint,
     spin_vertical,
     swing,
+    swing_at,
     swings,
     two_axes,
 )
@@ -50,9 +50,9 @@ def within_limits(builder: MotionBuilder, rng: np.random.Generator, n_poses: int
         reach = [0.3 * (upper - lower), limits.speed / omega, limits.acceleration / omega**2, np.full(count, MAX_PROFILE_SWING)]
         amplitude = np.where(frequency > 0, 0.7 * np.minimum.reduce(reach), 0.0)
         middle = np.where(limits.endless, at, np.clip(at, lower + 1.1 * amplitude, upper - 1.1 * amplitude))
-        return partial(_swing, middle=middle, amplitude=amplitude, frequency=np.maximum(frequency, 0.1), duration=swing_time)
+        return swing_at(middle, amplitude, np.maximum(frequency, 0.1), duration=swing_time)
 
-    tasks, only = [partial(_rest_at, position=position) for position in places(n_poses)], np.eye(count)
+    tasks, only = [_rest_at(position) for position in places(n_poses)], np.eye(count)
     for joint in moving:
         tasks += [swing(at, frequency * only[joint]) for at, frequency in zip(places(len(frequencies)), frequencies, strict=True)]
         others = moving[moving < joint][-n_other:]
@@ -60,8 +60,7 @@ def within_limits(builder: MotionBuilder, rng: np.random.Generator, n_poses: int
         if limits.endless[joint]:
             shares = 0.9 * np.linspace(0.3, 1.0, len(frequencies))
             speeds = shares * np.degrees(limits.speed[joint])
-            tasks += [partial(spin_joint, joint=int(joint), at_deg=np.where(limits.turns, np.degrees(at), np.nan), dwell=4.0,
-                              speeds_deg=speed)
+            tasks += [spin_joint(joint, np.where(limits.turns, np.degrees(at), np.nan), speed, dwell=4.0)
                       for at, speed in zip(places(len(shares)), speeds, strict=True)]
     run(builder, rng, tasks)
 
@@ -69,16 +68,8 @@ def within_limits(builder: MotionBuilder, rng: np.random.Generator, n_poses: int
 within_limits_short = partial(within_limits, n_poses=10, frequencies=(0.5,), swing_time=4.0, n_other=1)
 
 
-def _rest_at(builder, position):
-    builder.move_to(position)
-    builder.rest(4.0)
-
-
-def _swing(builder, middle, amplitude, frequency, duration):
-    builder.move_to(middle)
-    builder.rest(1.0)
-    builder.swing(amplitude, frequency, duration)
-    builder.rest(1.0)
+def _rest_at(position):
+    return lambda builder: builder.move_to(position).rest(4.0)
 
 
 THREE_AXIS = ('outer', 'middle', 'inner')
@@ -144,7 +135,7 @@ def make_profile(name: str, seed: int = 0, table: dict[str, Any] | Table | None 
         return builder.segments
 
     chosen = segments(1.0) if duration is None else stretch(segments, duration)
-    profile = Profile(name, tuple(chosen), joint_names, entry.table)
+    profile = Profile(name, chosen, joint_names, entry.table)
     _require_within(profile, limits)
     return profile
 
@@ -173,43 +164,39 @@ def _joint_names(entry, table):
     return tuple(table.joint_names)
 
 
+def _spins(directions, speeds_deg, dwell):
+    return [spin_vertical(up_b, speeds_deg, dwell) for up_b in directions]
+
+
 def _calibration(builder, rng):
-    tasks = poses(np.concatenate([FACES, EDGES, CORNERS]), 5.0)
-    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=SPEEDS_DEG, dwell=4.0) for axis in np.eye(3)]
-    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=SPEEDS_DEG[2], dwell=4.0) for axis in CORNERS[:4]]
-    tasks += [partial(spin_joint, joint=2, at_deg=[90 * k, 0, 0], speeds_deg=speed, dwell=5.0) for k, speed in enumerate(SPEEDS_DEG)]
-    tasks += [partial(spin_joint, joint=1, at_deg=[30, 0, inner], speeds_deg=SPEEDS_DEG[1], dwell=5.0) for inner in (0, 90)]
-    tasks += swings(((30.0, 0.5), (10.0, 1.0), (5.0, 2.0)), 6.0)
-    tasks += simultaneous((150.0, 100.0), 6.0)
-    run(builder, rng, tasks)
+    run(builder, rng, [
+        *poses(np.concatenate([FACES, EDGES, CORNERS]), 5.0),
+        *_spins(np.eye(3), SPEEDS_DEG, 4.0), *_spins(CORNERS[:4], SPEEDS_DEG[2], 4.0),
+        *(spin_joint(2, [90 * k, 0, 0], speed, dwell=5.0) for k, speed in enumerate(SPEEDS_DEG)),
+        *(spin_joint(1, [30, 0, inner], SPEEDS_DEG[1], dwell=5.0) for inner in (0, 90)),
+        *swings(((30.0, 0.5), (10.0, 1.0), (5.0, 2.0)), 6.0), *simultaneous((150.0, 100.0), 6.0)])
 
 
 def _short(builder, rng):
-    tasks = poses(np.concatenate([FACES, EDGES]), 4.0)
-    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=SPEEDS_DEG, dwell=2.0) for axis in np.eye(3)]
-    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=SPEEDS_DEG[2], dwell=2.0) for axis in CORNERS[:2]]
-    tasks += [partial(spin_joint, joint=2, at_deg=[0, 0, 0], speeds_deg=SPEEDS_DEG[1], dwell=3.0)]
-    tasks += swings(((20.0, 0.5), (10.0, 1.0)), 4.0)
-    tasks += simultaneous((150.0, 100.0), 2.0)[:4]
-    run(builder, rng, tasks)
+    run(builder, rng, [
+        *poses(np.concatenate([FACES, EDGES]), 4.0),
+        *_spins(np.eye(3), SPEEDS_DEG, 2.0), *_spins(CORNERS[:2], SPEEDS_DEG[2], 2.0), spin_joint(2, [0, 0, 0], SPEEDS_DEG[1], dwell=3.0),
+        *swings(((20.0, 0.5), (10.0, 1.0)), 4.0), *simultaneous((150.0, 100.0), 2.0)[:4]])
 
 
 def _quick(builder, rng):
-    tasks = poses(np.concatenate([FACES, EDGES[::2], CORNERS[::2]]), 2.0)
-    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=speed, dwell=2.0) for axis, speed in zip(np.eye(3), SPEEDS_DEG)]
-    tasks += swings(((10.0, 1.0),), 3.0)
-    tasks += simultaneous((150.0, 100.0), 2.0)[:3]
-    run(builder, rng, tasks, reference_every=100)
+    run(builder, rng, [
+        *poses(np.concatenate([FACES, EDGES[::2], CORNERS[::2]]), 2.0),
+        *(spin_vertical(axis, speed, 2.0) for axis, speed in zip(np.eye(3), SPEEDS_DEG)),
+        *swings(((10.0, 1.0),), 3.0), *simultaneous((150.0, 100.0), 2.0)[:3]], reference_every=100)
 
 
 def _six_faces(builder, _rng):
     """The usual motion: every axis up and down, and turned both ways at one speed."""
     builder.rest(3.0)
-    for task in poses(FACES, 3.0):
+    for task in [*poses(FACES, 3.0), *_spins(np.eye(3), SPEEDS_DEG[1], 2.0)]:
         task(builder)
-    for axis in np.eye(3):
-        spin_vertical(builder, axis, SPEEDS_DEG[1], dwell=2.0)
-    rest_at_zero(builder, 3.0)
+    builder.rest_at_home(3.0)
 
 
 def _static_only(builder, rng):
@@ -218,52 +205,31 @@ def _static_only(builder, rng):
 
 def _separating(builder, rng, n_angles=16, n_oblique=4, cycles=((40.0, 0.4), (10.0, 1.0), (4.0, 2.0), (2.0, 4.0)), swing_time=4.0):
     """Many angles, three speeds both ways, swings at several frequencies: separates similar effects."""
-    rings = [direction for k in range(n_angles) for direction in _rings(2 * np.pi * (k + 0.25) / n_angles)]
-    tasks = poses(rings, 2.2)
-    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=(60.0, 150.0, 300.0), dwell=2.0) for axis in np.eye(3)]
-    tasks += [partial(spin_vertical, up_b=axis, speeds_deg=(150.0, 300.0), dwell=2.0) for axis in CORNERS[:n_oblique]]
-    tasks += [partial(spin_joint, joint=2, at_deg=[0, 0, 0], speeds_deg=(30.0, 120.0), dwell=4.0)]
-    tasks += [partial(spin_joint, joint=1, at_deg=[90, 0, inner], speeds_deg=(40.0, 100.0), dwell=4.0) for inner in (0, 90)]
-    tasks += swings(cycles, swing_time)
-    tasks += simultaneous((250.0, 100.0), 2.5)
-    run(builder, rng, tasks, reference_every=20)
+    angles = 2 * np.pi * (np.arange(n_angles) + 0.25) / n_angles
+    rings = [direction for c, s in zip(np.cos(angles), np.sin(angles)) for direction in ([c, s, 0.0], [0.0, c, s], [s, 0.0, c])]
+    run(builder, rng, [
+        *poses(rings, 2.2), *_spins(np.eye(3), (60.0, 150.0, 300.0), 2.0), *_spins(CORNERS[:n_oblique], (150.0, 300.0), 2.0),
+        spin_joint(2, [0, 0, 0], (30.0, 120.0), dwell=4.0), *(spin_joint(1, [90, 0, inner], (40.0, 100.0), dwell=4.0) for inner in (0, 90)),
+        *swings(cycles, swing_time), *simultaneous((250.0, 100.0), 2.5)], reference_every=20)
 
 
 _separating_short = partial(_separating, n_angles=8, n_oblique=1, cycles=((20.0, 0.5), (5.0, 1.5), (2.0, 4.0)), swing_time=3.0)
 
 
-def _rings(angle):
-    c, s = np.cos(angle), np.sin(angle)
-    return [[c, s, 0.0], [0.0, c, s], [s, 0.0, c]]
-
-
 def _thermal(builder, _rng):
     """The same short round again and again, so that only time and temperature differ between rounds."""
-    rest_at_zero(builder, 20.0)
+    builder.rest_at_home(20.0)
     for turn in range(6):
-        for task in poses(FACES, 5.0):
+        for task in [*poses(FACES, 5.0), *_spins(np.eye(3), SPEEDS_DEG[1], 3.0), *swings(((10.0, 1.0),), 3.0)]:
             task(builder)
-        for axis in np.eye(3):
-            spin_vertical(builder, axis, SPEEDS_DEG[1], dwell=3.0)
-        for axis in range(3):
-            swing(builder, axis, 10.0, frequency=1.0, duration=3.0)
-        builder.move([90.0 * turn, 0.0, 0.0])
-        builder.rest(15.0)
+        builder.move([90.0 * turn, 0.0, 0.0]).rest(15.0)
 
 
-def _navigation(builder, _rng):
-    """Rest, 50 s of slow tumbling, rest, 50 s of livelier motion: for dead reckoning from either rest."""
-    builder.rest(10.0)
-    motion_primitives.tumble(builder, [70.0, 50.0, 60.0], [0.11, 0.17, 0.13], duration=50.0)
-    builder.rest(10.0)
-    motion_primitives.tumble(builder, [40.0, 25.0, 20.0], [0.31, 0.53, 0.71], duration=50.0)
-    builder.rest(5.0)
-
-
-def _tumbling(builder, _rng):
-    builder.rest(5.0)
-    motion_primitives.tumble(builder, [60.0, 45.0, 30.0], [0.7, 0.9, 1.1], duration=60.0)
-    builder.rest(5.0)
+def _tumbling(builder, _rng, rest, parts):
+    """Rest, then swing all joints at once from zero, for each part (deg, Hz, s, s of the rest after it)."""
+    builder.rest(rest)
+    for amplitude_deg, frequency, duration, rest_after in parts:
+        builder.move([0, 0, 0]).oscillate(amplitude_deg, frequency, duration, phase=[0.3, 1.1, 2.0], fade=2.0).rest(rest_after)
 
 
 def _random(builder, rng, directions=np.concatenate([FACES, CORNERS]), speed_ranges=((40, 80), (100, 150), (170, 220)), n_oblique=2,
@@ -271,13 +237,11 @@ def _random(builder, rng, directions=np.concatenate([FACES, CORNERS]), speed_ran
     """Drawn poses, spins both ways at every speed, swings and two-axis turns."""
     tasks = poses([_near(rng, up_b, 0.25) for up_b in directions], 2.6)
     speeds = np.array([rng.uniform(*limits, 3) for limits in speed_ranges])
-    tasks += [partial(spin_vertical, up_b=_near(rng, axis, 0.2), speeds_deg=speeds[:, k], dwell=2.0) for k, axis in enumerate(np.eye(3))]
-    tasks += [partial(spin_vertical, up_b=_near(rng, rng.choice(CORNERS), 0.3), speeds_deg=rng.uniform(120, 220), dwell=2.0)
-              for _ in range(n_oblique)]
-    tasks += [partial(spin_joint, joint=joint, at_deg=rng.uniform(-180, 180, 3), speeds_deg=rng.uniform(50, 120), dwell=3.0)
-              for joint in (1, 2)]
+    tasks += [spin_vertical(_near(rng, axis, 0.2), speeds[:, k], 2.0) for k, axis in enumerate(np.eye(3))]
+    tasks += [spin_vertical(_near(rng, rng.choice(CORNERS), 0.3), rng.uniform(120, 220), 2.0) for _ in range(n_oblique)]
+    tasks += [spin_joint(joint, rng.uniform(-180, 180, 3), rng.uniform(50, 120), dwell=3.0) for joint in (1, 2)]
     for axis in range(3):
-        tasks += [partial(swing, axis=axis, amplitude_deg=rng.uniform(7, 14) / frequency, frequency=frequency, duration=3.5)
+        tasks += [swing(axis, rng.uniform(7, 14) / frequency, frequency, duration=3.5)
                   for frequency in (rng.uniform(1.5, 3.0), rng.uniform(0.5, 1.0))[:n_swings]]
     rates = rng.uniform(80, 180, (n_simultaneous, 2)) * rng.choice([-1, 1], (n_simultaneous, 2))
     tasks += [simultaneous(pair, 2.0)[k] for k, pair in zip(rng.permutation(5), rates)]
@@ -293,24 +257,16 @@ def _near(rng, direction, spread):
     return vector / np.linalg.norm(vector)
 
 
-def _swing_freely(builder, at_deg, amplitude_deg, frequency):
-    builder.move(at_deg)
-    builder.rest(1.0)
-    builder.oscillate(amplitude_deg, frequency, 4.0)
-
-
 def _any_table(builder, rng):
     """Poses, spins at three speeds, swings and two joints at once for any number of joints."""
     count = builder.n_joints
     angles = rng.permuted(np.tile(np.arange(24) * 15.0, (count, 1)), axis=1).T
-    tasks = [partial(_rest_at, position=np.radians(row)) for row in angles]
-    only = np.eye(count)
+    tasks, only = [_rest_at(np.radians(row)) for row in angles], np.eye(count)
     for joint in range(count):
-        tasks += [partial(spin_joint, joint=joint, at_deg=rng.uniform(-180, 180, count), speeds_deg=speed, dwell=4.0)
-                  for speed in SPEEDS_DEG]
-        tasks += [partial(_swing_freely, at_deg=rng.uniform(-180, 180, count), amplitude_deg=10.0 / cycles * only[joint], frequency=cycles)
-                  for cycles in (0.5, 1.0, 2.0)]
-        tasks += [partial(two_axes, at_deg=at_deg, rates_deg=120.0 * only[joint] + 80.0 * only[other], dwell=5.0)
+        tasks += [spin_joint(joint, rng.uniform(-180, 180, count), speed, dwell=4.0) for speed in SPEEDS_DEG]
+        tasks += [swing_at(np.radians(rng.uniform(-180, 180, count)), np.radians(10.0 / cycles * only[joint]), cycles, duration=4.0,
+                           settle=False) for cycles in (0.5, 1.0, 2.0)]
+        tasks += [two_axes(at_deg, 120.0 * only[joint] + 80.0 * only[other], 5.0)
                   for other in range(joint) for at_deg in rng.uniform(-180, 180, (3, count))]
     run(builder, rng, tasks)
 
@@ -332,8 +288,11 @@ _REGISTRY = {
     'separating_short': _Entry('the same with fewer angles, about 6 min', _separating_short, n_joints=3, adapts=True),
     'separating_arm': _Entry('separating with the sensor on an arm of 0.27 m, so that spins exceed 1 g', _separating, _ON_ARM, 3),
     'thermal': _Entry('the same round six times while the temperature changes', _thermal, n_joints=3),
-    'navigation': _Entry('rest, 50 s of slow tumbling, rest, 50 s of livelier tumbling', _navigation, n_joints=3),
-    'tumbling': _Entry('60 s of three-axis sinusoids (60, 45, 30 deg at 0.7, 0.9, 1.1 Hz)', _tumbling, n_joints=3),
+    'navigation': _Entry('rest, 50 s of slow tumbling, rest, 50 s of livelier tumbling',
+                         partial(_tumbling, rest=10.0, parts=(([70.0, 50.0, 60.0], [0.11, 0.17, 0.13], 50.0, 10.0),
+                                                              ([40.0, 25.0, 20.0], [0.31, 0.53, 0.71], 50.0, 5.0))), n_joints=3),
+    'tumbling': _Entry('60 s of three-axis sinusoids (60, 45, 30 deg at 0.7, 0.9, 1.1 Hz)',
+                       partial(_tumbling, rest=5.0, parts=(([60.0, 45.0, 30.0], [0.7, 0.9, 1.1], 60.0, 5.0),)), n_joints=3),
     'two_axis': _Entry('poses, spins, swings and simultaneous turns of a two-axis table', _any_table, n_joints=2),
     'within_limits': _Entry('poses, swings and, where a joint has no end, spins, within the limits of every joint', within_limits),
     'within_limits_short': _Entry('the same with fewer of them', within_limits_short),
