@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from argparse import Namespace, _ArgumentGroup
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from imu_calibration.cli.parser import OneLineParser
 
@@ -86,6 +87,11 @@ def add_model_arguments(parser: OneLineParser, *, searched: bool = True) -> None
 def add_effects_argument(group: _ArgumentGroup) -> None:
     """Add the option of effects in addition to the catalogue."""
     group.add_argument('--effects', dest='catalogue', metavar='FILE', help='YAML or calibration.yaml with additional effects')
+
+
+def named_as(function: Callable, options: Namespace) -> dict[str, Any]:
+    """Return the parsed arguments that have the names of parameters of a function."""
+    return {name: value for name, value in vars(options).items() if name in signature(function).parameters}
 
 
 def choices_of(options: Namespace) -> Choices:

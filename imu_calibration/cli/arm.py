@@ -3,7 +3,7 @@
 from argparse import Namespace
 
 from imu_calibration.cli.arguments import BAG
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 
 EXAMPLES = ('session --imu-topic /imu_a/data_raw --imu-topic /imu_b/data_raw',
@@ -23,7 +23,6 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.between_imus.arm import estimate_arm
     from imu_calibration.calibration.hand_workflow import read_by_hand
     from imu_calibration.cli.show import warn
-    from imu_calibration.cli.terminal import Terminal
     from imu_calibration.core.units import with_sd
     from imu_calibration.preprocessing.checks import Preflight, warnings
     from imu_calibration.use_cases.recordings import Topics, open_bag, source_of
@@ -45,10 +44,9 @@ def run(options: Namespace) -> VerbResult:
         warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(preflight.findings))
     first, second = imus
     result = estimate_arm(first, second)
-    out = Terminal.standard()
     for axis, value, sd in zip('xyz', result.arm, result.arm_sd):
         shown, spread = with_sd(value * 1e3, sd * 1e3)
-        out.print(f'{axis}: {shown} +- {spread} mm')
+        print_line(f'{axis}: {shown} +- {spread} mm')
     for line in result.lines():
-        out.print(line)
+        print_line(line)
     return VerbResult(0, {'arm': result.arm, 'sd': result.arm_sd, 'unit': 'm', 'notes': list(result.lines())})

@@ -36,6 +36,5 @@ def run(options: Namespace) -> VerbResult:
                          *(error_text(part[when], part.get('unit', entry['unit'])) for when in ('before', 'after')),
                          ratio_text(part)))
     show_table(out, ('sensor', 'motion', *numbers), rows, numbers=numbers)
-    for line in str(found).splitlines():
-        out.print(line)
+    out.print(str(found))
     return VerbResult(found.exit_code, {'proof': found.proof, 'helps': found.helps})

@@ -30,6 +30,5 @@ def run(options: Namespace) -> VerbResult:
         shown.append((row.name, *(with_sd(v * factor, row.sd * factor)[0] for v in (row.first, row.second)), difference, sd, unit,
                       '-' if row.ratio is None else f'{row.ratio:.1f}'))
     show_table(out, ('parameter', *numbers[:-1], 'unit', 'in sd'), shown, numbers=numbers)
-    for line in result.lines:
-        out.print(line)
+    out.print('\n'.join(result.lines))
     return VerbResult(0, {'rows': [asdict(row) for row in result.rows], 'lines': list(result.lines)})

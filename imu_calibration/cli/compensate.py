@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import BAG, add_topic_arguments
+from imu_calibration.cli.arguments import BAG, add_topic_arguments, named_as
 from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 
 EXAMPLES = ('drive --calibration result/calibration.yaml --output drive_corrected',
@@ -31,9 +31,7 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Namespace) -> VerbResult:
     """Compensate into a new bag, print warnings and losses, return the exit code."""
     from imu_calibration.use_cases.compensate import compensate
-    names = ('output', 'corrected_topic', 'target_frame', 'target_xyz', 'target_rpy', 'anyway', 'noise', 'correct_stamps', 'imu_topic',
-             'temperature_topic', 'frame_id')
-    found = compensate(options.bag, options.calibration, **{name: getattr(options, name) for name in names})
+    found = compensate(options.bag, **named_as(compensate, options))
     for line in found.warnings:
         print_line(f'note: {line}')
     print_line(f'written: {options.output} with {options.corrected_topic} ({found.count} samples)')

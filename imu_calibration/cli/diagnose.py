@@ -3,7 +3,7 @@
 from argparse import Namespace
 
 from imu_calibration.cli import arguments
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 
 EXAMPLES = ('session --table table.yaml --output finding', 'by_hand_session --output finding')
 
@@ -24,7 +24,6 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Namespace) -> VerbResult:
     """Diagnose into a folder that can be written, print the findings, return the exit code."""
     from imu_calibration.cli.show import warn
-    from imu_calibration.cli.terminal import Terminal
     from imu_calibration.document import files
     from imu_calibration.use_cases.diagnose import diagnose
     from imu_calibration.use_cases.view import foxglove
@@ -37,8 +36,7 @@ def run(options: Namespace) -> VerbResult:
         found.save(folder)
         if options.mcap:
             found.save_overlay(options.mcap)
-        out = Terminal.standard()
-        out.print(str(found))
         also = '' if found.proposed is None else ', and extended.yaml with the proposed formula in the model,'
-        out.print(f'written: diagnosis.json, calibration.yaml and report.html{also} in {folder}')
+        for line in (*str(found).splitlines(), f'written: diagnosis.json, calibration.yaml and report.html{also} in {folder}'):
+            print_line(line)
         return VerbResult(found.exit_code, found.document)

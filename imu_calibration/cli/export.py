@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_stand_arguments, add_topic_arguments, stand_of
+from imu_calibration.cli.arguments import add_stand_arguments, add_topic_arguments, named_as, stand_of
 from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 
@@ -34,14 +34,11 @@ def run(options: Namespace) -> VerbResult:
     stand = stand_of(options)
     if stand is not None and not options.bag:
         raise InputError('a table or arm needs the recording --bag BAG, none was given; give both')
+    from imu_calibration.use_cases.choices import topics_of
     from imu_calibration.use_cases.exporting import export_calibration
-    from imu_calibration.use_cases.recordings import Topics
-    topics = Topics(options.imu_topic, options.joint_topic, options.temperature_topic, options.frame_id)
-    found = export_calibration(options.document, options.to, output=options.output, noise=options.noise, rate=options.rate,
-                               bag=options.bag, stand=stand, topics=topics, anyway=options.anyway)
-    for line in found.lines:
+    found = export_calibration(options.document, stand=stand, topics=topics_of(vars(options)), **named_as(export_calibration, options))
+    for line in (*found.lines, f'written: {options.output}'):
         print_line(line)
-    print_line(f'written: {options.output}')
     return VerbResult(found.exit_code, {'output': options.output, 'lines': found.lines})
 
 

@@ -2,6 +2,7 @@
 
 from argparse import Namespace
 
+from imu_calibration.cli.arguments import named_as
 from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 
 EXAMPLES = ('imu.yaml --from kalibr --output calibration.yaml', 'params.txt --from px4 --output calibration.yaml')
@@ -20,7 +21,7 @@ def run(options: Namespace) -> VerbResult:
     """Read, write, and list the parameters that the file lacks."""
     from imu_calibration.estimation.solution import HELD
     from imu_calibration.use_cases.exporting import import_calibration
-    found = import_calibration(options.file, options.source, output=options.output, frame_id=options.frame_id)
+    found = import_calibration(options.file, **named_as(import_calibration, options))
     held = [name for name, status in found.requested.items() if status == HELD]
     for sensor, word in found.decisions.items():
         print_line(': '.join([f'{sensor} {word}', *filter(None, [found.decision_reasons.get(sensor)])]))

@@ -3,7 +3,7 @@
 from argparse import Namespace
 from itertools import groupby
 
-from imu_calibration.cli.arguments import add_topic_arguments
+from imu_calibration.cli.arguments import add_topic_arguments, named_as
 from imu_calibration.cli.parser import OneLineParser, VerbResult, complain, print_line
 
 EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
@@ -28,10 +28,8 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.allan.document import to_mapping
     from imu_calibration.document import files
     from imu_calibration.use_cases.noise import noise
-    chosen = {} if options.horizon is None else {'horizon': options.horizon}
     with files.output_folder(options.output) as folder:
-        found = noise(options.bag, imu_topic=options.imu_topic, temperature_topic=options.temperature_topic, frame_id=options.frame_id,
-                      nominal=options.nominal, **chosen)
+        found = noise(options.bag, **{name: value for name, value in named_as(noise, options).items() if value is not None})
         for warning in found.warnings:
             complain(f'warning: {warning}')
         found.save(folder, report=not options.no_report)

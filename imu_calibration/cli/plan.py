@@ -2,14 +2,13 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, stand_of
+from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, choices_of, stand_of
 from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
 
 EXAMPLES = ('--table table.yaml --output plan', '--by-hand --output plan')
-CHOICES = ('tolerances', 'noise', 'accelerometer_model', 'gyroscope_model', 'reference_model', 'catalogue', 'gravity')
 MAX_PRINTED_MOTIONS = 12
 """Motions of joints that are printed; plan.yaml has all."""
 
@@ -45,15 +44,14 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.document import files
     from imu_calibration.planning.planner import plan_to_mapping
     from imu_calibration.use_cases.plan import by_hand, plan
-    choices = {name: getattr(options, name) for name in CHOICES}
     stand = None if options.by_hand and options.motion == 'any' else _stand(options)
     with files.output_folder(options.output) as folder:
         if stand is None:
-            made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **choices)
+            made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **choices_of(options))
         else:
             made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate,
                         with_bound=not options.no_bound, separate=[name for name in options.separate.split(',') if name],
-                        diagnosis=options.diagnosis, around=_pose(options.around), reach=options.reach, **choices)
+                        diagnosis=options.diagnosis, around=_pose(options.around), reach=options.reach, **choices_of(options))
         made.save(folder, report=not options.no_report, storage=options.storage)
     _show(made, folder)
     return VerbResult(made.exit_code, plan_to_mapping(made.plan, made.provenance))

@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, add_topic_arguments, stand_of
+from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, add_topic_arguments, choices_of, named_as, stand_of
 from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
@@ -10,9 +10,6 @@ from msg_adapters.storages import identifiers
 
 EXAMPLES = ('--effect gyro_g_sensitivity --grade consumer --table table.yaml --output session',
             '--replay recording --calibration result/calibration.yaml --table table.yaml --output simulated')
-SIMULATE_OPTIONS = ('calibration', 'size', 'grade', 'seed', 'imu_seed', 'duration', 'imu_rate', 'joint_rate', 'encoder_resolution_deg',
-                    'stamp_jitter_us', 'temperature', 'catalogue')
-"""Options that are arguments of `simulate` by the same name."""
 
 
 def add_arguments(parser: OneLineParser) -> None:
@@ -46,14 +43,12 @@ def run(options: Namespace) -> VerbResult:
     """Simulate and write."""
     from imu_calibration.use_cases.simulate import replay, simulate
     if options.replay is None:
-        made = simulate(options.profile, effects=options.effect, table=stand_of(options),
-                        **{name: getattr(options, name) for name in SIMULATE_OPTIONS})
+        made = simulate(**named_as(simulate, options) | {'effects': options.effect, 'table': stand_of(options)})
     else:
         if options.calibration is None:
             raise InputError('--replay requires the IMU to simulate, no calibration was given; add --calibration FILE', key='calibration',
                              code='replay_without_calibration')
-        made = replay(options.replay, options.calibration, stand_of(options), seed=options.seed,
-                      **{name: getattr(options, name) for name in ('imu_topic', 'joint_topic', 'temperature_topic')})
+        made = replay(options.replay, options.calibration, stand_of(options), seed=options.seed, **choices_of(options))
     made.save(options.output, storage=options.storage, compression=options.compression)
     samples = made.samples
     print_line(f'written: {options.output} ({made.duration:.0f} s, {len(samples.imu or ())} Imu, '

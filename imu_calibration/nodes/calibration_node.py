@@ -19,6 +19,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.live_poses import LiveByHand
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.settings import setting
@@ -32,7 +34,7 @@ from imu_calibration.nodes.inputs import BatchInput, latched_qos, output_qos, wa
 from imu_calibration.nodes.lifecycle import announce, run_node
 from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of, words_of
-from imu_calibration.nodes.session_files import LiveSession, SessionFiles, reference_of
+from imu_calibration.nodes.session_files import LiveSession, SessionFiles
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.provenance import provenance_with
@@ -101,28 +103,33 @@ class CalibrationNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__('calibration_node', **options)
         self.settings = declare_parameters(self, CalibrationNodeSettings, self._change_files, hints=HINTS['calibration_node'])
-        self._live_settings = declare_parameters(self, LiveSettings, self._change_session)
-        windows = declare_parameters(self, WindowSettings, self._change_session)
-        self._options = replace(calibration_options({name: chosen or None for name, chosen in self._choices().items()}), windows=windows)
-        self._hand_settings = declare_parameters(self, LiveByHandSettings, self._change_session)
+        self._session = {LiveSettings: declare_parameters(self, LiveSettings, self._change_session),
+                         WindowSettings: declare_parameters(self, WindowSettings, self._change_session)}
+        self._options = calibration_options({name: chosen or None for name, chosen in self._choices().items()})
+        self._session[LiveByHandSettings] = declare_parameters(self, LiveByHandSettings, self._change_session)
         robot = declare_parameters(self, RobotSettings)
         joints = [] if not robot.urdf_file and self.settings.table_file in NO_TABLE else ['joint_states']
         announce(self, ['imu/data_raw', *joints, 'imu/temperature'], ['imu/calibration', 'imu/residual', 'imu/coverage'])
-        self._reference = reference_of(chain_of(self, robot, self.settings.table_file, frame_id=self.settings.frame_id),
-                                       words_of(robot, self.settings.table_file))
+        self._table = chain_of(self, robot, self.settings.table_file, frame_id=self.settings.frame_id)
         place = SessionFiles(self.settings.save_file)
         live = self._resumed(place) if self.settings.resume else self._make_live()
-        self._gatherer = LiveGatherer(self._reference.joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id)
+        joint_names = None if self._table is None else self._table.joint_names
+        self._gatherer = LiveGatherer(joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id)
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
         self._coverage = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos())
-        listeners = Listeners(self._publish_document, self._publish_residuals, self._publish_coverage)
+        listeners = Listeners(lambda text: self._publish(self._document, String(data=text)), self._publish_residuals,
+                              lambda coverage: self._publish(self._coverage, markers_of(coverage, self.get_clock().now().to_msg())))
         self.worker = CalibrationWorker(self._gatherer, live, self._make_live, place=place, autosave_period=self.settings.autosave_period,
                                         listeners=listeners, hints=HINTS['calibration_node'], provenance=self._provenance(robot))
         for what in ('solve', 'diagnose', 'save', 'reset'):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what))
         self._complaints, self._started = Complaints(self.get_logger()), time.monotonic()
         self._listen()
+        reference = ("by hand, since neither 'table_file' nor 'urdf_file' was given: hold the IMU still in 12 different attitudes and turn "
+                     'it in between' if joint_names is None else
+                     f'on {words_of(robot, self.settings.table_file)} with the joints {", ".join(joint_names)}')
+        self.get_logger().info(f'calibrates {reference}; ~/save writes {place.calibration}')
         self._guide = CalibrationGuide(self._inputs, f'ros2 service call {self.get_fully_qualified_name()}/save std_srvs/srv/Trigger',
                                        live.observations.removesuffix('s'))
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
@@ -131,12 +138,11 @@ class CalibrationNode(Node):
     def _listen(self) -> None:
         topics = {'imu': (Imu, 'imu/data_raw', self._gatherer.add_imu),
                   'temperature': (Temperature, 'imu/temperature', self._gatherer.add_temperature)}
-        if self._reference.joint_names is not None:
+        if self._table is not None:
             topics['joints'] = (JointState, 'joint_states', self._gatherer.add_joints)
         self._inputs = {name: BatchInput(self, kind, topic, add=add, depth=INPUT_DEPTH, single=name != 'joints')
                         for name, (kind, topic, add) in topics.items()}
         watch_inputs(self, list(self._inputs.values()))
-        self.get_logger().info(f'calibrates {self._reference.text}; ~/save writes {self.worker.place.calibration}')
 
     def close(self) -> str:
         """End the worker after its present step; return the outcome for unsaved motion."""
@@ -153,7 +159,10 @@ class CalibrationNode(Node):
         return provenance_with('calibration_node', (), self._choices(), stand=None if stand in NO_TABLE else files.user_path(stand))
 
     def _make_live(self, saved: bytes | None = None) -> LiveSession:
-        return self._reference.begin(self._options, self._live_settings, self._hand_settings, saved)
+        options, live = replace(self._options, windows=self._session[WindowSettings]), self._session[LiveSettings]
+        if self._table is None:
+            return LiveByHand(options, live, self._session[LiveByHandSettings], saved=saved)
+        return LiveCalibration(self._table, options, live, saved=saved)
 
     def _resumed(self, place: SessionFiles) -> LiveSession:
         try:
@@ -185,23 +194,12 @@ class CalibrationNode(Node):
         self.worker.autosave_period, self.settings = group.autosave_period, group
 
     def _change_session(self, group: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
-        if isinstance(group, WindowSettings):
-            self._options = replace(self._options, windows=group)
-        elif isinstance(group, LiveSettings):
-            self._live_settings = group
-        else:
-            self._hand_settings = group
+        self._session[type(group)] = group
         self.worker.ask(lambda: self.worker.change(group))
-
-    def _publish_document(self, text: str) -> None:
-        self._publish(self._document, String(data=text))
 
     def _publish_residuals(self, residuals: Any) -> None:
         for message in Packed.of_rows(encode_imu(residuals)).views():
             self._publish(self._residual, bytes(message))
-
-    def _publish_coverage(self, coverage: Any) -> None:
-        self._publish(self._coverage, markers_of(coverage, self.get_clock().now().to_msg()))
 
     def _publish(self, publisher: Any, message: Any) -> None:
         try:

@@ -74,7 +74,7 @@ class CalibrationWorker(threading.Thread):
         self._looked = time.monotonic()
         self._trouble = ''
         self._faults: dict[str, str] = {}
-        self._note_fault('place', self.place.try_place())
+        self._faults['place'] = self.place.try_place()
         self.state = WorkerState(groups=self.live.groups())
 
     @property
@@ -126,14 +126,11 @@ class CalibrationWorker(threading.Thread):
         try:
             step()
         except ImuCalibrationError as error:
-            self._note_fault(name, error.with_hint(self.hints))
+            self._faults[name] = error.with_hint(self.hints)
         except Exception as error:
-            self._note_fault(name, f'{name.replace("_", " ")} failed and is left out: {shortened(f"{type(error).__name__}: {error}", 200)}')
+            self._faults[name] = f'{name.replace("_", " ")} failed and is left out: {shortened(f"{type(error).__name__}: {error}", 200)}'
         else:
-            self._note_fault(name, '')
-
-    def _note_fault(self, name: str, line: str) -> None:
-        self._faults[name] = line
+            self._faults[name] = ''
 
     def _take(self) -> None:
         # Silence is measured from the last call: messages that arrived during a solution are processed in the next one.
@@ -175,7 +172,7 @@ class CalibrationWorker(threading.Thread):
                 self._diagnosis.want()
         except ImuCalibrationError as error:
             self._trouble = error.with_hint(self.hints)
-            self._note_fault('solution', '' if isinstance(error, NotObservableError) else self._trouble)
+            self._faults['solution'] = '' if isinstance(error, NotObservableError) else self._trouble
 
     def _diagnose_when_due(self) -> None:
         n_windows = self.live.n_windows
@@ -205,7 +202,7 @@ class CalibrationWorker(threading.Thread):
         result = self.live.solve(pending, self._provenance | {'mode': 'live', 'solution': self._n_solutions + 1})
         self._n_solutions += 1
         self._trouble, self._new_windows, self._closed = '', False, pending
-        self._note_fault('solution', '')
+        self._faults['solution'] = ''
         text = calibration_to_text(result.calibration)
         self.listeners.calibration(text)
         return_freed_memory()
@@ -235,7 +232,7 @@ class CalibrationWorker(threading.Thread):
         if text is None and not self.live.n_windows:
             return False, f'{what}; no file was written'
         whole, written = self.place.save(self.live, text)
-        self._note_fault('place', '' if whole else written)
+        self._faults['place'] = '' if whole else written
         return whole and text is not None, f'{what}; {written}'
 
     def _reset(self) -> tuple[bool, str]:
@@ -260,7 +257,7 @@ class CalibrationWorker(threading.Thread):
 
     def _autosave(self) -> None:
         if self.place.autosave(self.live, self.autosave_period):
-            self._note_fault('place', '')
+            self._faults['place'] = ''
 
     def _tell(self) -> None:
         counts = self.live.counts

@@ -6,7 +6,6 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,9 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 
-from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.errors import ImuCalibrationError, InputError, did_you_mean
 from imu_calibration.core.settings import Setting, describe, override
 
-RETIRED = {'reliable': 'inputs connect as their publishers offer',
-           'diagnosis_samples': 'evenly spread windows are used, as in a recording'}
-"""Parameters of earlier versions -> why they are not needed any more."""
 UNKNOWN_PARAMETER = 'is unknown and ignored'
 """What is logged of a parameter that the node does not have."""
 NOT_OURS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
@@ -146,13 +142,8 @@ def unknown_parameters(node: Node) -> list[str]:
     for name in sorted(given):
         if node.has_parameter(name) or name.startswith(NOT_OURS):
             continue
-        if name in RETIRED:
-            lines.append(f"parameter '{name}' is not needed any more: {RETIRED[name]}")
-            continue
-        known = list(node.get_parameters_by_prefix(''))
-        near = get_close_matches(name, known, 1)
-        lines.append(f"parameter '{name}' {UNKNOWN_PARAMETER}" + (f"; did you mean '{near[0]}'?" if near else
-                                                                     f"; see 'ros2 param list {node.get_fully_qualified_name()}'"))
+        near = did_you_mean(name, node.get_parameters_by_prefix(''))
+        lines.append(f"parameter '{name}' {UNKNOWN_PARAMETER}{near or f'; see ros2 param list {node.get_fully_qualified_name()}'}")
     return lines
 
 

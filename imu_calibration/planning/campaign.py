@@ -282,7 +282,7 @@ class Campaign:
         return '; beyond bias and matrix there is ' + ', '.join(each.effect + text for each, text in zip(self.findings, mates, strict=True))
 
 
-MAX_SEPARATING_SECONDS = 180.0
+LONGEST_SEPARATION = 180.0
 """Longest plan that separates causes, s; causes that need more count as one cause for this table."""
 
 
@@ -312,14 +312,10 @@ def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, no
         When an effect is unknown, or no motion can show it.
 
     """
-    sensors = {name: sensor for sensor, name in options.catalogue.effects(table.joint_names)}
-    for name in (suspect.effect, *suspect.mates):
-        if name not in sensors:
-            raise InputError(f"a cause must be an effect of the catalogue, got '{name}'; name one that it has", code='cause_unknown')
-    causes = [(sensors[name], name) for name in (suspect.effect, *suspect.mates)]
+    causes = [(options.catalogue.owner_of(name, table.joint_names), name) for name in (suspect.effect, *suspect.mates)]
     planner = make_separator(table, with_suspect(calibration, causes[0], suspect.sizes), causes, noise=noise, rate=rate, options=options,
                              sizes=suspect.sizes, limits=limits)
-    planner.within(MAX_SEPARATING_SECONDS)
+    planner.within(LONGEST_SEPARATION)
     return planner
 
 

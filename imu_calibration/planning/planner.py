@@ -247,8 +247,8 @@ class Planner:
         room = np.stack([position - limits.lower, limits.upper - position])
         away = np.where(room[1] >= room[0], 1.0, -1.0) * np.clip(room.max(axis=0), 0.0, reach)
         segments = MotionBuilder(len(position), limits=limits, start=position).move_to(position + away).move_to(position).segments
-        return PlannedMotion(MotionKind.MOVE, library.names, np.asarray(position, float), segments, 'a small motion of every joint and back',
-                             limits)
+        return PlannedMotion(MotionKind.MOVE, library.names, np.asarray(position, float), segments,
+                             'a small motion of every joint and back', limits)
 
     def unwinding(self, position: np.ndarray) -> PlannedMotion | None:
         """Return the move that turns endless joints with restricted turns back to the middle of their range; None within half a turn."""

@@ -1,5 +1,6 @@
 """The page of a calibration, and its sections with figures: observability, error budget, readings at rest."""
 
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -46,8 +47,7 @@ def strongest(calibration: Calibration, live: np.ndarray) -> list[tuple[str, str
 
 def _correlation(calibration, live):
     sd = calibration.sd[live]
-    names = [name for name, flag in zip(calibration.param_names, live) if flag]
-    return calibration.covariance[np.ix_(live, live)] / np.outer(sd, sd), names
+    return calibration.covariance[np.ix_(live, live)] / np.outer(sd, sd), list(compress(calibration.param_names, live))
 
 
 def short_name(name: str) -> str:
@@ -61,8 +61,7 @@ def _bars(figure, result, live):
     """One bar per parameter on a logarithmic axis, one at the tolerance."""
     calibration = result.calibration
     share = (calibration.sd / result.tolerances)[live]
-    names = [n for n, flag in zip(calibration.param_names, live) if flag]
-    colours = [STATUS[s] for s, flag in zip(calibration.status, live) if flag]
+    names, colours = list(compress(calibration.param_names, live)), [STATUS[status] for status in compress(calibration.status, live)]
     axes = figure.subplots()
     place = np.arange(len(names))[::-1]
     low = min(1e-3, float(share.min()) / 2)

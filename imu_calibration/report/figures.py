@@ -52,23 +52,12 @@ class Drawn(str):
         if kind == '.svg':
             files.write_text(path, str(self))
         else:
-            files.write_whole(path, self.pdf if kind == '.pdf' else self.png)
+            files.write_whole(path, self.bytes_as(kind[1:]))
 
-    @property
-    def pdf(self) -> bytes:
-        """The figure as PDF; the same input gives the same bytes."""
-        from matplotlib.backends.backend_pdf import FigureCanvasPdf
+    def bytes_as(self, kind: str) -> bytes:
+        """Return the figure as 'pdf', or as 'png' with 200 pixels per inch; the same input gives the same bytes."""
         whole = io.BytesIO()
-        FigureCanvasPdf(self.figure).print_pdf(whole, metadata={'CreationDate': None})
-        return whole.getvalue()
-
-    @property
-    def png(self) -> bytes:
-        """The figure as PNG on white, 200 pixels per inch."""
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        whole = io.BytesIO()
-        FigureCanvasAgg(self.figure)
-        self.figure.savefig(whole, format='png', dpi=200, facecolor='white')
+        self.figure.savefig(whole, format=kind, dpi=200, facecolor='white', metadata={'CreationDate': None} if kind == 'pdf' else None)
         return whole.getvalue()
 
     @property

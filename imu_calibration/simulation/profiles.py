@@ -53,7 +53,7 @@ def within_limits(builder: MotionBuilder, rng: np.random.Generator, n_poses: int
         return swing_at(middle, amplitude, np.maximum(frequency, 0.1), duration=swing_time)
 
     tasks, only = [_rest_at(position) for position in places(n_poses)], np.eye(count)
-    for joint in moving:
+    for joint in moving.tolist():
         tasks += [swing(at, frequency * only[joint]) for at, frequency in zip(places(len(frequencies)), frequencies, strict=True)]
         others = moving[moving < joint][-n_other:]
         tasks += [swing(at, 0.3 * only[joint] + 0.45 * only[other]) for other, at in zip(others, places(max(len(others), 1)), strict=False)]

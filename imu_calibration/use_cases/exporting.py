@@ -7,7 +7,7 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.exports.export import Export, export, find_reader, find_target
+from imu_calibration.document.exports.export import Export, export, find_target
 from imu_calibration.document.exports.loss import TrialMotion, import_file, motion_of, recorded_motion, temperature_at
 from imu_calibration.preprocessing.window_finder import session_truth
 from imu_calibration.use_cases.recordings import Topics, name_of, source_of, temperatures
@@ -89,7 +89,7 @@ def import_calibration(path: str | PathLike, source: str, *, output: str | PathL
         When it is no such file, or a file cannot be read or written.
 
     """
-    target = find_reader(source)
+    target = find_target(source, read=True)
     found = import_file(target, files.read_bytes(path, f'file of {target.name}'), Path(path), frame_id=frame_id)
     if output is not None:
         files.write_text(output, calibration_to_text(found))

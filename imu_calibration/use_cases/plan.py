@@ -23,7 +23,7 @@ from imu_calibration.effects.sensor_model import BASE, SensorModel, parse_effect
 from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.kinematics.motion_limits import NOT_CHECKED, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.kinematics.table import Table
-from imu_calibration.planning.campaign import make_separator
+from imu_calibration.planning.campaign import LONGEST_SEPARATION, make_separator
 from imu_calibration.planning.planner import Plan, make_planner, plan_by_hand, plan_to_mapping, trajectory_to_mapping
 from imu_calibration.planning.planning_problem import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -31,8 +31,6 @@ from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.stand import Stand, table_of
 
-LONGEST_SEPARATION = 180.0
-"""Longest duration of a plan that separates effects, s."""
 ACCUMULATOR = '.npz'
 """Suffix of the accumulator that a live session saves with its calibration."""
 PLAN_START_NS = 1_000_000_000

@@ -21,7 +21,7 @@ from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.comparison import compare
 from imu_calibration.document.exports.affine import capability_of, lower_times_rotation
-from imu_calibration.document.exports.export import UNITS, all_targets, export, find_reader, find_target, loss_lines
+from imu_calibration.document.exports.export import UNITS, all_targets, export, find_target, loss_lines
 from imu_calibration.document.exports.loss import ROUNDING_LOSS, import_file, motion_of, standard_motion
 from imu_calibration.document.exports.target import Readings
 from imu_calibration.document.exports.targets.openvins import upper_times_rotation
@@ -474,13 +474,13 @@ def test_imu_tk_is_read_with_both_its_files(seed):
             Path(folder, f'test_imu{ending}').write_text(text)
         for named in texts:
             path = Path(folder, f'test_imu{named}')
-            found = import_file(find_reader('imu-tk'), path.read_bytes(), path)
+            found = import_file(find_target('imu-tk', read=True), path.read_bytes(), path)
             true = compensate(found, ref.force_s, ref.rate_s, alpha_s=ref.alpha_s)
             for made, ending, raw in ((true.force, '.acc', ref.force_s), (true.rate, '.gyro', ref.rate_s)):
                 np.testing.assert_allclose(made, [programs.imu_tk(texts[ending], sample) for sample in raw], rtol=0, atol=40 * EXACT)
         Path(folder, 'test_imu.gyro').unlink()
         path = Path(folder, 'test_imu.acc')
-        alone = import_file(find_reader('imu-tk'), path.read_bytes(), path)
+        alone = import_file(find_target('imu-tk', read=True), path.read_bytes(), path)
         assert set(np.array(alone.status)[[name.startswith('gyroscope') for name in alone.param_names]]) == {'held'}
 
 
@@ -489,7 +489,7 @@ def test_imu_tk_is_read_with_both_its_files(seed):
                          (b'', b'\xff\xfe\x00', b'[1, 2]', b'a: [', b'{"value0": 3}', b'imu0: 5', b'CAL_ACC0_XOFF nan x', b'SM: [1]'))
 def test_files_of_something_else_are_refused_in_one_line(name, content, tmp_path):
     with pytest.raises(InputError) as error:
-        import_file(find_reader(name), content, tmp_path / 'file')
+        import_file(find_target(name, read=True), content, tmp_path / 'file')
     assert '\n' not in str(error.value)
 
 
@@ -498,12 +498,12 @@ def test_files_of_something_else_are_refused_in_one_line(name, content, tmp_path
     ('ardupilot', 'INS_ACCOFFS_X,0.1\nINS_TCAL1_ENABLE,1\nINS_TCAL1_GYR3_Z,2', ('INS_TCAL1_GYR3_Z', 2))))
 def test_thermal_curves_are_refused_rather_than_cut(name, line, values):
     with refused(InputError, 'not_linear', *values):
-        import_file(find_reader(name), line.encode(), 'file')
+        import_file(find_target(name, read=True), line.encode(), 'file')
 
 
 def test_a_chain_without_intrinsics_is_the_perfect_imu_and_its_noise_is_kept():
     chain = b'%YAML:1.0\nimu0:\n  accelerometer_noise_density: 0.002\n  gyroscope_noise_density: 0.0001\n  update_rate: 400.0\n'
-    found = import_file(find_reader('openvins'), chain, 'chain.yaml')
+    found = import_file(find_target('openvins', read=True), chain, 'chain.yaml')
     np.testing.assert_array_equal(found.of('gyroscope', Role.LINEAR), np.eye(3))
     assert found.noise('accelerometer')[0][0] == pytest.approx(0.002 * 20)
 

@@ -429,7 +429,7 @@ def test_what_a_diagnosis_said_becomes_motions_that_tell_its_causes_apart():
     quadratic = told.goal.causes[1].size * told.coordinates.units[told.coordinates.model.slices['gyroscope', 'gyro_quadratic']]
     np.testing.assert_allclose(quadratic, [1e-3, -1e-3, 1e-3])   # as the diagnosis says, not as a usual session would have it
     assert not np.allclose(told.goal.causes[1].size, imitating.size, rtol=0.1)
-    with refused(InputError, 'cause_unknown', 'gremlins'):
+    with refused(InputError, 'effect_unknown', 'gremlins'):
         separator_of(table, known, Suspect('gyro_quadratic', ('gremlins',)), noise=noise)
 
 

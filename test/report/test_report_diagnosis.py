@@ -75,7 +75,7 @@ def test_a_figure_is_svg_pdf_axes_and_arrays(result, tmp_path):
         assert (tmp_path / name).read_bytes().startswith(head)
     with refused(InputError, 'figure_suffix', 'p.jpg'):
         drawing.save(tmp_path / 'p.jpg')
-    assert drawing.pdf == drawing.pdf
+    assert drawing.bytes_as("pdf") == drawing.bytes_as("pdf")
     left, right = drawing.data
     axis, _, values = cause_of(result.diagnosis, 'gyroscope', ('force',))
     np.testing.assert_array_equal(left['lines'][0][1], values)

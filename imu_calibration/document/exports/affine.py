@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -57,7 +58,7 @@ SLOW_OFFSETS = OFFSETS + THERMAL_OFFSETS
 """Effects that an estimator with biases in its state estimates itself."""
 
 
-def of(sensor: str, capabilities: tuple[Capability, ...]) -> tuple[Capability, ...]:
+def of(sensor: str, capabilities: Iterable[Capability]) -> tuple[Capability, ...]:
     """Return the holdings of one sensor."""
     return tuple(capability for capability in capabilities if capability.sensor == sensor)
 

@@ -204,9 +204,9 @@ def all_targets() -> dict[str, Target]:
     return {target.name: target for target in sorted((t for module in modules for t in module.TARGETS), key=lambda t: t.name)}
 
 
-def find_target(name: str) -> Target:
+def find_target(name: str, *, read: bool = False) -> Target:
     """
-    Return the target of a name.
+    Return the target of a name, whose files can be written, or `read`.
 
     Raises
     ------
@@ -214,26 +214,8 @@ def find_target(name: str) -> Target:
         When there is none.
 
     """
-    return _find(name, [target for target in all_targets().values() if target.write is not None], 'written')
-
-
-def find_reader(name: str) -> Target:
-    """
-    Return the target of a name; its files must be readable.
-
-    Raises
-    ------
-    InputError
-        When there is none.
-
-    """
-    return _find(name, [target for target in all_targets().values() if target.read is not None], 'read')
-
-
-def _find(name: str, fitting: list[Target], what: str) -> Target:
-    for target in fitting:
-        if target.name == name:
-            return target
-    raise InputError(f"the name of a program whose files can be {what} is required, got '{name}'"
-                     f"{did_you_mean(name, (target.name for target in fitting))}; choose from "
-                     f"{', '.join(target.name for target in fitting)}")
+    fitting = {target.name: target for target in all_targets().values() if (target.read if read else target.write) is not None}
+    if name not in fitting:
+        raise InputError(f"the name of a program whose files can be {'read' if read else 'written'} is required, got '{name}'"
+                         f"{did_you_mean(name, fitting)}; choose from {', '.join(fitting)}")
+    return fitting[name]

@@ -25,6 +25,7 @@ from imu_calibration.document.exports.affine import (
     find_pose,
     held_values,
     moved,
+    of,
 )
 from imu_calibration.document.exports.target import Numbers, Read, Readings, Target
 from imu_calibration.effects.base import SENSORS, Effect
@@ -234,7 +235,7 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
         When it is no such file, or its numbers can belong to no IMU.
 
     """
-    assert target.read is not None   # `find_reader` gives no other
+    assert target.read is not None   # `find_target` gives no other
     found = target.read(content, path)
     if target.whole:
         return from_mapping(found.numbers)
@@ -248,8 +249,10 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
 
 def _document(target: Target, found: Read, imu: AffineImu, axes: str, path: Any, frame_id: str) -> Calibration:
     holds = tuple(capability for capability in target.holds if capability not in found.lacks)
-    names: dict[str, tuple[str, ...]] = {sensor: tuple(_names(sensor, holds, imu)) for sensor in SENSORS}
-    model = SensorModel(names['accelerometer'], names['gyroscope'], temperature_ref_c=imu.temperature_ref_c)
+    # Bias and matrix always, further effects where the file gives them a value.
+    named = [*OFFSETS, *MATRICES, *(capability for capability in holds if np.any(imu.value(capability)))]
+    accelerometer, gyroscope = (tuple(dict.fromkeys(capability.effect.name for capability in of(sensor, named))) for sensor in SENSORS)
+    model = SensorModel(accelerometer, gyroscope, temperature_ref_c=imu.temperature_ref_c)
     values, sd = model.prior()
     status = np.full(len(values), HELD, dtype=object)
     for effect in model.effects:
@@ -268,14 +271,3 @@ def _document(target: Target, found: Read, imu: AffineImu, axes: str, path: Any,
         model, values, np.diag(sd**2), tuple(status), frame_id, gauge, statistics=statistics, conditions=conditions, provenance=provenance,
         decision=dict.fromkeys(SENSORS, str(UNPROVEN)), decision_reasons=dict.fromkeys(SENSORS, reason),
         notes=("next: measure its error on a recording: 'imu_calibration check'",)))
-
-
-def _names(sensor: str, holds: tuple[Capability, ...], imu: AffineImu):
-    """Yield the effects of a sensor in a document: bias and matrix always, further ones where the file gives them a value."""
-    for always in (*OFFSETS, *MATRICES):
-        if always.sensor == sensor:
-            yield always.effect.name
-    for capability in holds:
-        further = capability.effect.name not in (OFFSETS[0].effect.name, MATRICES[0].effect.name)
-        if capability.sensor == sensor and further and np.any(imu.value(capability)):
-            yield capability.effect.name
