@@ -30,6 +30,8 @@ class Setting:
     """Whether it names an input of a session: settings files omit it, because they would override earlier options."""
     path: bool = False
     """Whether it is the path of a file; such a ROS parameter is read-only, because any participant can set writable ones."""
+    choices: tuple = ()
+    """Permitted values; (): any."""
     name: str = ''
     """Name of the field, the option and the parameter."""
 
@@ -72,4 +74,7 @@ def _checked(declared, value):
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         if (low is not None and value < low) or (high is not None and value > high):
             raise InputError(f"setting '{declared.name}' must lie in [{low}, {high}], got {value!r}; choose a value inside")
+    if declared.choices and value not in declared.choices:
+        raise InputError(f"setting '{declared.name}' must be one of {', '.join(declared.choices)}, got '{value}'; choose one",
+                         code='choice_unknown')
     return value

@@ -6,7 +6,7 @@ from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.health import CalibrationHealth, HealthOptions, StopWatch
 from imu_calibration.compensation.stream import requested_transfer
 from imu_calibration.core.documents import version_of
-from imu_calibration.core.errors import DocumentError, ImuCalibrationError, InputError, shortened
+from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files, trust
 from imu_calibration.document.calibration import Calibration
@@ -18,7 +18,6 @@ from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.robot_stand import TF_STATIC, StaticFrames
 
 FROM_FILE, FROM_TOPIC, FILE_THEN_TOPIC = 'file', 'topic', 'file_then_topic'
-ADOPT = (FROM_FILE, FROM_TOPIC, FILE_THEN_TOPIC)
 """
 Source of the calibrations.
 
@@ -37,7 +36,8 @@ class CompensatorSettings:
     adopt: str = setting(FILE_THEN_TOPIC, '', 'source of calibrations; file: calibration_file only, for the field; '
                          'topic: imu/calibration, which replaces the file; '
                          'file_then_topic: imu/calibration only while no calibration_file is named',
-                         symptom='a calibration on the topic is not adopted, or replaces the file', live=True)
+                         symptom='a calibration on the topic is not adopted, or replaces the file', live=True,
+                         choices=(FROM_FILE, FROM_TOPIC, FILE_THEN_TOPIC))
     anyway: bool = setting(False, '', 'also correct a sensor whose decision is unproven; one whose decision is harms is never corrected',
                            symptom='the correction may increase the error of the readings', live=True)
     passthrough: bool = setting(False, '', 'publish the messages unchanged until there is a calibration',
@@ -76,10 +76,6 @@ class CompensatorSettings:
     public_executor: bool = setting(False, '', "use rclpy's public executor, at two to four times the computing time, "
                                     "instead of a wait set of our own",
                                     symptom='messages are lost above 3 kHz', fixed='the loop is chosen when the node starts')
-
-    def __post_init__(self):
-        if self.adopt not in ADOPT:
-            raise InputError(f"parameter 'adopt' must be {', '.join(ADOPT)}, got '{self.adopt}'; choose one")
 
     @property
     def takes_topic(self) -> bool:

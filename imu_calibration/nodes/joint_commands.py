@@ -132,11 +132,9 @@ def make_command(node: Node, how: str, refused: Callable[[str], None]) -> TopicC
     Raises
     ------
     InputError
-        When it is not in `COMMANDS`, or requires an action without control_msgs.
+        When it requires an action without control_msgs.
 
     """
-    if how not in COMMANDS:
-        raise InputError(f"parameter 'command' must be one of {', '.join(COMMANDS)}, got '{how}'; choose one", code='choice_unknown')
     if how == 'topic':
         return TopicCommand(node)
     try:

@@ -32,7 +32,7 @@ from imu_calibration.nodes.calibration_status import driven_markers
 from imu_calibration.nodes.complaints import LOG_ERROR, LOG_INFO, Complaints, say
 from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.inputs import BatchInput, MatchedInput, latched_qos, watch_inputs
-from imu_calibration.nodes.joint_commands import OtherDrivers, make_command
+from imu_calibration.nodes.joint_commands import COMMANDS, OtherDrivers, make_command
 from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node
 from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
@@ -41,7 +41,7 @@ from imu_calibration.planning.campaign import Campaign, CampaignSettings, Suspec
 from imu_calibration.planning.driver import Driver, DriverSettings, DriveState
 from imu_calibration.planning.motion_library import up_at
 from imu_calibration.planning.planner import Planner, make_planner
-from imu_calibration.planning.planning_problem import expected_noise, require_grade
+from imu_calibration.planning.planning_problem import expected_noise
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.use_cases.resources import config_file
@@ -61,13 +61,13 @@ class PlannerNodeSettings:
     gyroscope_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that are not estimated')
     reference_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that are not estimated')
     grade: str = setting('industrial', '', 'grade of the noise that is expected before it is known: ' + ', '.join(sorted(GRADES)),
-                         symptom='the predicted standard deviations are not reached')
+                         symptom='the predicted standard deviations are not reached', choices=tuple(sorted(GRADES)))
     noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise, path; empty: that of the grade',
                               symptom='the predicted standard deviations are not reached', session=True, path=True)
     imu_rate: float = setting(100.0, 'Hz', 'Imu messages per second', (1.0, 20000.0),
                               'the predicted standard deviations are not reached')
     command: str = setting('topic', '', 'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory, needs '
-                           'control_msgs) or auto (the action where there is one)', symptom='nothing moves')
+                           'control_msgs) or auto (the action where there is one)', symptom='nothing moves', choices=COMMANDS)
     max_turns: float = setting(1.0, '1', 'turns of an endless joint to either side of its position at the first start, unwound at the end; '
                                '0: unlimited, for slip rings', (0.0, 1e4), 'too large: cables are wound up; too small: slow plans',
                                fixed='the range of every joint is set at the first start')
@@ -95,7 +95,6 @@ class PlannerNode(Node):
         self._campaign_settings = declare_parameters(self, CampaignSettings, self._change_campaign)
         driver_settings = declare_parameters(self, DriverSettings, self._change_driver)
         settings = self.settings
-        require_grade(settings.grade)
         robot = declare_parameters(self, RobotSettings)
         announce(self, ['joint_states', 'imu/calibration', '/diagnostics'], ['joint_trajectory', 'imu/coverage'], note=NOT_CHECKED)
         table = chain_of(self, robot, settings.table_file)

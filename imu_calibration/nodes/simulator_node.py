@@ -19,7 +19,7 @@ from sensor_msgs.msg import Imu, JointState, Temperature
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.document.calibration import true_calibration
@@ -63,7 +63,7 @@ class SimulatorSettings:
     calibration_file: str = setting('', '', 'calibration document with the true parameters, path; empty: a random IMU',
                                     symptom='another IMU is simulated', session=True, path=True)
     grade: str = setting('industrial', '', 'grade of noise and of the random IMU: ' + ', '.join(sorted(GRADES)),
-                         symptom='noise too large or small')
+                         symptom='noise too large or small', choices=tuple(sorted(GRADES)))
     hide: str = setting('', '', 'further errors of the IMU, by their physics, names joined by +: ' + ', '.join(CAUSES),
                         symptom='the diagnosis has a different finding, or none', session=True)
     hide_size: float = setting(1.0, '1', 'size of the hidden error, in units of the drawn size', (0.0, 100.0), 'too small: not detectable')
@@ -148,8 +148,6 @@ class SimulatorNode(Node):
 
     def _true_imu(self):
         settings = self.settings
-        if settings.grade not in GRADES:
-            raise InputError(f"parameter 'grade' must be one of {', '.join(sorted(GRADES))}, got '{settings.grade}'")
         if settings.calibration_file:
             calibration = files.read_calibration(Path(settings.calibration_file).expanduser())
             return calibration.model, calibration.values

@@ -288,15 +288,10 @@ def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
 
 def expected_noise(figures: NoiseFigures | None, grade: str, rate: float) -> dict[str, NoiseModel]:
     """Return sensor -> NoiseModel of samples at `rate` (Hz): the identified model, or that of a grade."""
-    require_grade(grade)
+    if grade not in GRADES:
+        raise InputError(f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise")
     if figures is None:
         return noise_of_grade(GRADES[grade].noise, rate)
     slow = bias_processes(figures)   # the slow part as Gauss-Markov processes
     return {sensor: NoiseModel(np.array([axis.white**2 * rate for axis in figures.sensor(sensor)]), np.ones(3), bias_processes=slow[sensor])
             for sensor in SENSORS}
-
-
-def require_grade(grade: str) -> None:
-    """Refuse a grade that is none with an InputError."""
-    if grade not in GRADES:
-        raise InputError(f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise")

@@ -111,7 +111,6 @@ def excess(trajectory: JointTrajectory, limits: MotionLimits, step: float = 0.00
 
 LIMIT_ROUNDING = 1e-6
 """Tolerance of a trajectory beyond a limit, relative to it."""
-LIMIT_CHOICES = ('refuse', 'slow', 'none')
 KEPT_MOTIONS = 8
 """Motions kept in memory; queries look back by less."""
 
@@ -122,7 +121,8 @@ class ControllerSettings:
 
     limits: str = setting('refuse', '', 'treatment of a trajectory beyond range, speed or acceleration of the joints: refuse, slow (it '
                           'is slowed to the limits; beyond the range it is refused) or none (it is followed)',
-                          symptom='trajectories are not followed, or further and faster than the joints can')
+                          symptom='trajectories are not followed, or further and faster than the joints can',
+                         choices=('refuse', 'slow', 'none'))
     lag: float = setting(0.0, 's', 'delay of the joints relative to a trajectory', (0.0, 10.0), 'measured joints are late')
     speed_scaling: float = setting(1.0, '1', 'share of their speed at which trajectories are followed', (0.01, 1.0),
                                    'motions last longer than commanded')
@@ -158,8 +158,6 @@ class TableController:
     def __init__(self, profile: Profile | None, joint_names: tuple[str, ...], *, limits: MotionLimits | None = None,
                  settings: ControllerSettings = ControllerSettings(), repeat: bool = False):
         self.joint_names, self.limits, self.settings = tuple(joint_names), limits or free_limits(len(joint_names)), settings
-        if settings.limits not in LIMIT_CHOICES:
-            raise InputError(f"setting 'limits' must be one of {', '.join(LIMIT_CHOICES)}, got '{settings.limits}'; choose one")
         if settings.stall_joint and settings.stall_joint not in self.joint_names:
             raise InputError(f"setting 'stall_joint' must be one of {', '.join(self.joint_names)}, got '{settings.stall_joint}'; name one",
                              code='joint_unknown')

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.settings import override
 from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 
 pytest.importorskip('rclpy')
@@ -17,7 +18,7 @@ from refusal import refused
 
 from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND  # noqa: E402
 from imu_calibration.nodes import joint_commands  # noqa: E402
-from imu_calibration.nodes.planner_node import MID_MOTION  # noqa: E402
+from imu_calibration.nodes.planner_node import MID_MOTION, PlannerNodeSettings  # noqa: E402
 from imu_calibration.nodes.planner_worker import Activity, Peers, PlannerWorker, findings_from  # noqa: E402
 from imu_calibration.planning.campaign import Suspect  # noqa: E402
 from imu_calibration.planning.driver import DriverSettings, DriveState  # noqa: E402
@@ -138,7 +139,7 @@ def test_an_action_without_control_msgs_is_refused_and_auto_takes_the_topic(monk
         joint_commands.make_command(node, 'action', print)
     assert isinstance(joint_commands.make_command(node, 'auto', print), joint_commands.TopicCommand)
     with refused(InputError, 'choice_unknown', 'command', 'topic, action, auto'):
-        joint_commands.make_command(node, 'telepathy', print)
+        override(PlannerNodeSettings(), {'command': 'telepathy'})
 
 
 class Table:
