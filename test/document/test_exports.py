@@ -24,7 +24,7 @@ from imu_calibration.document.exports.affine import capability_of, lower_times_r
 from imu_calibration.document.exports.export import UNITS, all_targets, export, find_target, loss_lines
 from imu_calibration.document.exports.loss import ROUNDING_LOSS, import_file, motion_of, standard_motion
 from imu_calibration.document.exports.target import Readings
-from imu_calibration.document.exports.targets.openvins import upper_times_rotation
+from imu_calibration.document.exports.targets.visual_inertial import upper_times_rotation
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.kinematics.rotations import Reference, lever_matrix

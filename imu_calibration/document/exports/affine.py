@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -107,6 +107,14 @@ def held_values(calibration: Calibration, effect: Effect, capability: Capability
     """Return the values of an effect as the target represents them: its prior where it is not represented, shape (size,)."""
     values = calibration.values[calibration.model.slices[effect.key]]
     return effect.prior_values() if capability is None else capability.held(values)
+
+
+def undone(corrections: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> AffineImu:
+    """Return the IMU whose readings ``matrix @ readings - offset`` corrects, from sensor -> (matrix, offset); other sensors are perfect."""
+    matrix = {sensor: np.linalg.inv(turn) for sensor, (turn, _) in corrections.items()}
+    bias = {sensor: matrix[sensor] @ offset for sensor, (_, offset) in corrections.items()}
+    perfect = AffineImu()
+    return replace(perfect, matrix=perfect.matrix | matrix, bias=perfect.bias | bias)
 
 
 def affine_of(calibration: Calibration, capabilities: tuple[Capability, ...]) -> AffineImu:
