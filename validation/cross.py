@@ -10,8 +10,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import HELPS
 from imu_calibration.effects.reference_effects import FAMILY, total_lags
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate
-from imu_calibration.use_cases.check import check
+from imu_calibration.use_cases.calibrate import calibrate, check
 from validation.section import Section, text
 from validation.shaft import read
 

@@ -19,8 +19,10 @@ from imu_calibration.core.errors import ImuCalibrationError  # noqa: E402
 from imu_calibration.core.samples import SampleBlock  # noqa: E402
 from imu_calibration.core.units import DEG, MILLI_G  # noqa: E402
 from imu_calibration.kinematics.table import Table  # noqa: E402
-from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
-from imu_calibration.use_cases.check import check  # noqa: E402
+from imu_calibration.use_cases.calibrate import (
+    calibrate,  # noqa: E402
+    check,  # noqa: E402
+)
 from validation.recordings import BY_HAND, data_folder, gravity_of, label, load  # noqa: E402
 from validation.section import Section  # noqa: E402
 

@@ -3,8 +3,7 @@
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document.decision import HARM, HELPS, harmed
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate
-from imu_calibration.use_cases.check import check
+from imu_calibration.use_cases.calibrate import calibrate, check
 from validation.section import Section, text
 
 SEED = 31

@@ -25,7 +25,7 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.core.units import error_text
     from imu_calibration.document.decision import ratio_text
     from imu_calibration.preprocessing.checks import warnings
-    from imu_calibration.use_cases.check import check
+    from imu_calibration.use_cases.calibrate import check
     found = check(options.bag, options.calibration, stand_of(options), **choices_of(options))
     warn([finding.to_mapping() for finding in warnings(found.findings)])
     out, numbers = Terminal.standard(), ('seconds', 'before', 'after', 'after / before, 95 %')

@@ -27,9 +27,8 @@ from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.nodes.calibration_status import CalibrationGuide, markers_of, statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker
-from imu_calibration.nodes.complaints import LOG_ERROR, LOG_INFO, Complaints, say
 from imu_calibration.nodes.diagnosis_thread import Listeners, give_arrays_own_pages
-from imu_calibration.nodes.diagnostics import DiagnosticsPublisher
+from imu_calibration.nodes.diagnostics import LOG_ERROR, LOG_INFO, Complaints, DiagnosticsPublisher, say
 from imu_calibration.nodes.inputs import BatchInput, latched_qos, output_qos, watch_inputs
 from imu_calibration.nodes.lifecycle import announce, run_node
 from imu_calibration.nodes.parameters import HINTS, declare_parameters

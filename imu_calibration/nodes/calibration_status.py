@@ -27,8 +27,7 @@ from imu_calibration.calibration.coverage import (
 from imu_calibration.calibration.diagnosis import live_diagnosis as diagnosis
 from imu_calibration.core.progress import LiveState
 from imu_calibration.document.decision import HARMS
-from imu_calibration.nodes.complaints import LOG_INFO, LOG_WARN
-from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, make_status
+from imu_calibration.nodes.diagnostics import ERROR, LOG_INFO, LOG_WARN, OK, WARN, make_status
 from imu_calibration.nodes.inputs import MatchedInput
 from imu_calibration.preprocessing.stamping import COUNTED, REGULAR
 from imu_calibration.preprocessing.stream_watch import StreamState

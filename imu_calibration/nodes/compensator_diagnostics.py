@@ -12,8 +12,7 @@ from imu_calibration.core.units import HOTTEST_C
 from imu_calibration.document.decision import decisions_text
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.nodes.adoption import Adopted
-from imu_calibration.nodes.complaints import REMINDER
-from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
+from imu_calibration.nodes.diagnostics import ERROR, OK, REMINDER, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.preprocessing.stamping import COUNTED
 
 SERIOUS = ('frame_id', 'not an Imu message', 'failed')

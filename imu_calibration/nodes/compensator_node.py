@@ -24,7 +24,7 @@ from imu_calibration.document import files
 from imu_calibration.nodes import relay_loop
 from imu_calibration.nodes.adoption import Adopted, Awaited, CompensatorSettings, adopt, again, has_moved
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
-from imu_calibration.nodes.complaints import LOG_ERROR, Complaints
+from imu_calibration.nodes.diagnostics import LOG_ERROR, Complaints
 from imu_calibration.nodes.inputs import MatchedInput, latched_qos, output_qos, sent_ns, watch_inputs
 from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node
 from imu_calibration.nodes.message_compensation import LiveCompensation

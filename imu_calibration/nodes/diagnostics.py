@@ -5,13 +5,15 @@ Levels by convention: OK: works as intended, including the start; WARN: works an
 is set by the receiver when messages are missing.
 """
 
-from collections.abc import Callable, Mapping
+import re
+import time
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from imu_calibration.core.errors import shortened
+from imu_calibration.core.errors import printable, shortened
 from imu_calibration.nodes.lifecycle import every
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -69,3 +71,75 @@ class DiagnosticsPublisher:
         except Exception:
             if self._node.context.ok():   # otherwise the node is ending
                 raise
+
+
+LOG_INFO, LOG_WARN, LOG_ERROR = 'info', 'warning', 'error'
+REMINDER = 60.0
+"""Interval at which a lasting fault is logged again, s."""
+REPEAT_SECONDS = 10.0
+"""Least interval between two lines about an intermittent fault, s."""
+MOST_KINDS = 1000
+"""Largest number of kinds whose last time is stored: it bounds the memory."""
+
+
+def say(logger: Any, level: str, line: str) -> None:
+    """Log a line without control characters; one call per severity, because rclpy allows one severity per line of code."""
+    line = printable(line)
+    if level == LOG_ERROR:
+        logger.error(line)
+    elif level == LOG_WARN:
+        logger.warning(line)
+    else:
+        logger.info(line)
+
+
+class Complaints:
+    """
+    Logs lines for a node.
+
+    Two lines are of the same kind when they differ in their numbers only, or have the same ``subject: ``, where the subject ends with a
+    topic in brackets (see `kind_of`).
+
+    Parameters
+    ----------
+    logger : logger of a node
+    clock : callable
+        Seconds of a steady clock.
+
+    """
+
+    def __init__(self, logger: Any, clock: Callable[[], float] = time.monotonic):
+        self._logger, self._clock = logger, clock
+        self._said: dict[str, float] = {}
+        self._open: dict[str, str] = {}
+
+    def now(self, source: str, warnings: Iterable[str] = (), errors: Iterable[str] = (), *, patience: float = REPEAT_SECONDS) -> None:
+        """Log the present faults of `source` and the end of earlier ones; an ended one is repeated after `patience` seconds at least."""
+        present = {kind_of(source, line): (level, line) for level, lines in ((LOG_WARN, warnings), (LOG_ERROR, errors)) for line in lines}
+        for kind in [kind for kind in self._open if kind.startswith(source + ':') and kind not in present]:
+            say(self._logger, LOG_INFO, f'over: {self._open.pop(kind)}')
+        for kind, (level, line) in present.items():
+            if self._due(kind, REMINDER if kind in self._open else patience):
+                say(self._logger, level, line)
+                self._open[kind] = line
+
+    def event(self, line: str, level: str = LOG_WARN) -> None:
+        """Log an event, which has no end."""
+        if self._due(kind_of('', line), REPEAT_SECONDS):
+            say(self._logger, level, line)
+
+    def _due(self, kind: str, pause: float) -> bool:
+        now = self._clock()
+        if now - self._said.get(kind, float('-inf')) < pause:
+            return False
+        self._said.pop(kind, None)
+        self._said[kind] = now
+        while len(self._said) > MOST_KINDS:
+            del self._said[next(iter(self._said))]
+        return True
+
+
+def kind_of(source: str, line: str) -> str:
+    """Return the kind of a line: its text before ``): ``, or all of it, without numbers."""
+    subject, bracket, _ = line.partition('): ')
+    return source + ':' + re.sub(r'[\d.]+', '#', subject if bracket else line)

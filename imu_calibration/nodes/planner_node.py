@@ -29,8 +29,7 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text
 from imu_calibration.kinematics.motion_limits import NOT_CHECKED, TrajectoryPoints, limit_words, limits_of, missing_ranges, range_warnings
 from imu_calibration.nodes.calibration_status import driven_markers
-from imu_calibration.nodes.complaints import LOG_ERROR, LOG_INFO, Complaints, say
-from imu_calibration.nodes.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, make_status
+from imu_calibration.nodes.diagnostics import ERROR, LOG_ERROR, LOG_INFO, OK, WARN, Complaints, DiagnosticsPublisher, make_status, say
 from imu_calibration.nodes.inputs import BatchInput, MatchedInput, latched_qos, watch_inputs
 from imu_calibration.nodes.joint_commands import COMMANDS, OtherDrivers, make_command
 from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node

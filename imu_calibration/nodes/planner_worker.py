@@ -15,7 +15,7 @@ from typing import Any
 
 from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND, MATES_KEY, SIZE_KEY
 from imu_calibration.core.errors import ImuCalibrationError, InputError, shortened
-from imu_calibration.nodes.complaints import LOG_ERROR, LOG_INFO
+from imu_calibration.nodes.diagnostics import LOG_ERROR, LOG_INFO
 from imu_calibration.planning.campaign import Campaign, Suspect
 from imu_calibration.planning.driver import Driver, DriveState
 

@@ -17,7 +17,7 @@ from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import StaticTransforms, root_of, table_from_urdf
-from imu_calibration.nodes.complaints import LOG_WARN, say
+from imu_calibration.nodes.diagnostics import LOG_WARN, say
 from imu_calibration.nodes.inputs import latched_qos
 from msg_adapters.layout import clean_name
 

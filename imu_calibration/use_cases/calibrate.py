@@ -1,4 +1,4 @@
-"""From recordings to a calibration that prints, draws and saves itself."""
+"""From recordings to a calibration that prints, draws and saves itself, and the test of a calibration on another recording."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Unpack
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
-from imu_calibration.calibration.hand_workflow import calibrate_without_table
+from imu_calibration.calibration.hand_workflow import calibrate_without_table, check_by_hand, gravity_of
 from imu_calibration.calibration.result import CalibrationResult, exit_code, summary
-from imu_calibration.calibration.table_calibration import check_on_table
+from imu_calibration.calibration.table_calibration import CheckResult, check_on_table
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter, report
 from imu_calibration.core.samples import SampleBlock
@@ -22,8 +22,8 @@ from imu_calibration.document.decision import Verdict
 from imu_calibration.document.verdict import judged
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
-from imu_calibration.use_cases.provenance import provenance_with
-from imu_calibration.use_cases.recordings import jobs_for, name_of, open_bag, process_mapper, source_of
+from imu_calibration.use_cases.provenance import made_from, provenance_with
+from imu_calibration.use_cases.recordings import jobs_for, name_of, open_bag, process_mapper, provenance_of, source_of
 from imu_calibration.use_cases.stand import Stand, table_of
 
 
@@ -51,7 +51,7 @@ class Calibrated:
 
     def plot(self, sensor: str = 'accelerometer') -> Drawn:
         """Return the errors of one sensor in every window, before and after, as a figure for a notebook."""
-        from imu_calibration.report.residuals import draw_windows
+        from imu_calibration.report.calibration_sections import draw_windows
         return draw_windows(self.result.window_errors(), sensor)
 
     @cached_property
@@ -147,3 +147,53 @@ def _side_by_side(sources, table, options, recordings, jobs):
     advance = counter('recordings', len(recordings) if jobs > 1 else 0)
     mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
     return calibrate_by_evidence(sources, table, options, mapper=mapper, names=names).result
+
+
+def check(recording: str | PathLike | SampleBlock, calibration: Calibration | str | PathLike, table: Stand | None = None,
+          **choices: Unpack[Choices]) -> CheckResult:
+    """
+    Test whether a calibration helps on a recording: the error before and after, by sensor and kind of motion.
+
+    Parameters
+    ----------
+    recording : path-like or SampleBlock
+        A bag, or samples in memory, of the IMU that was calibrated.
+    calibration : Calibration or path-like
+    table : path-like, Table or Arm, optional
+        The reference of this recording; it need not be the one of the calibration. Without it gravity is: the IMU held still in some
+        attitudes, and the turns between them.
+    choices
+        See `Choices`; the topics, the window settings and the local gravity apply.
+
+    Raises
+    ------
+    ImuCalibrationError
+        When the recording cannot be used, or is of an IMU that is not on the table.
+
+    """
+    check_names(choices)
+    calibration = files.given_calibration(calibration)
+    options, topics = calibration_options(choices), topics_of(choices)
+    if table is None:
+        result = check_by_hand(source_of(recording, topics, want_joints=False), calibration, options)
+        return replace(result, notes=(*_gravity(options, calibration), *_notes(recording, calibration)))
+    if not isinstance(recording, SampleBlock):
+        open_bag(recording, topics, want_joints=True).close()
+    table = table_of(table, [recording], topics, gravity=options.gravity)
+    source = source_of(recording, topics, table.joint_names)
+    result = check_on_table([source], table, calibration, options=options, names=[name_of(recording)])
+    return replace(result, notes=_notes(recording, calibration))
+
+
+def _gravity(options, calibration):
+    """Return a note on the gravity used, when none was given."""
+    if options.gravity:
+        return ()
+    taken = gravity_of(calibration, options)
+    return (f'gravity is that of the calibration, {taken:.6g} m/s^2; give the local value if it differs',)
+
+
+def _notes(recording, calibration):
+    """Return a note when the calibration was made from this very recording."""
+    same = made_from(calibration.provenance) & made_from(provenance_of([recording], {}))
+    return ('it was calibrated from this recording: the result can differ on new recordings',) if same else ()

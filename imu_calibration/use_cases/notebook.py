@@ -14,7 +14,7 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.use_cases.calibrate import Calibrated
 from imu_calibration.use_cases.calibrate import calibrate as _calibrate
-from imu_calibration.use_cases.check import check as _check
+from imu_calibration.use_cases.calibrate import check as _check
 from imu_calibration.use_cases.choices import Choices
 from imu_calibration.use_cases.compensate import compensate as _compensate
 from imu_calibration.use_cases.diagnose import diagnose as _diagnose

@@ -12,8 +12,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.estimation.window_statistics import Regime
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate
-from imu_calibration.use_cases.check import check
+from imu_calibration.use_cases.calibrate import calibrate, check
 
 from worlds.misfit_worlds import make_pair
 from worlds.physics import write_bag

@@ -7,8 +7,7 @@ import pytest
 from imu_calibration.cli.main import main
 from imu_calibration.core.samples import SampleBlock, TemperatureSamples
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.use_cases.calibrate import calibrate
-from imu_calibration.use_cases.check import check
+from imu_calibration.use_cases.calibrate import calibrate, check
 from msg_adapters.write import write_session
 
 from worlds.hand_sessions import GRAVITY

@@ -5,8 +5,7 @@ import pytest
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document.decision import HELPS
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate
-from imu_calibration.use_cases.check import check
+from imu_calibration.use_cases.calibrate import calibrate, check
 
 from worlds.misfit_worlds import make_pair
 

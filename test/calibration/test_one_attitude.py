@@ -8,8 +8,7 @@ from imu_calibration.document.decision import UNPROVEN, decide, reason_of
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate
-from imu_calibration.use_cases.check import check
+from imu_calibration.use_cases.calibrate import calibrate, check
 
 from worlds.misfit_worlds import SHAFT, make_pair
 

@@ -13,7 +13,7 @@ from imu_calibration.nodes.calibration_status import (  # noqa: E402
     WorkerState,  # noqa: E402
     statuses_of,  # noqa: E402
 )
-from imu_calibration.nodes.complaints import MOST_KINDS, REMINDER, Complaints  # noqa: E402
+from imu_calibration.nodes.diagnostics import MOST_KINDS, REMINDER, Complaints  # noqa: E402
 from imu_calibration.preprocessing.stamping import COUNTED, StampLine  # noqa: E402
 from imu_calibration.preprocessing.stream_watch import StreamState  # noqa: E402
 

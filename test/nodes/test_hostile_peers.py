@@ -11,7 +11,7 @@ pytest.importorskip('rclpy')
 from std_msgs.msg import String  # noqa: E402
 
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
-from imu_calibration.nodes.complaints import Complaints  # noqa: E402
+from imu_calibration.nodes.diagnostics import Complaints  # noqa: E402
 from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
 
 pytestmark = pytest.mark.live

@@ -20,10 +20,9 @@ from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.kinematics import strapdown
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.report.calibration_sections import calibration_report, reading_tables
+from imu_calibration.report.calibration_sections import autocorrelation, calibration_report, reading_tables
 from imu_calibration.report.navigation_section import expected_growth, motion_growth, noise_densities
 from imu_calibration.report.page import fixed, text
-from imu_calibration.report.residuals import autocorrelation
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
