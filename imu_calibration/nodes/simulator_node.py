@@ -33,10 +33,9 @@ from imu_calibration.nodes.lifecycle import announce, run_node
 from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.playback import PLAYBACK_DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
-from imu_calibration.simulation.live import LiveSimulation
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import CAUSES, GRADES, hidden_causes
-from imu_calibration.simulation.session import SimulationOptions, random_values
+from imu_calibration.simulation.session import LiveSimulation, SimulationOptions, random_values
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import trajectory_from_message

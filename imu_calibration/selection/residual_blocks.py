@@ -21,7 +21,7 @@ from imu_calibration.selection.noise_beside_effects import natural_processes
 from imu_calibration.selection.questions import TEMPERATURE_SPAN
 from imu_calibration.selection.saturation import measured
 from imu_calibration.selection.stamp_jitter import StampJitter, jitter_ratio, stamp_jitter
-from imu_calibration.simulation.session import predict_windows
+from imu_calibration.simulation.replay import predict_windows
 
 MIN_BLOCK_SECONDS = 0.25
 """Least length of a block of a moving window, s; at rest a window is one block."""

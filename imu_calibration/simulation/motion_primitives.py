@@ -38,8 +38,8 @@ def spin_vertical(up_b: np.ndarray, speeds_deg: ArrayLike, dwell: float) -> Task
 
 def spin_joint(joint: int, at_deg: ArrayLike, speeds_deg: ArrayLike, *, dwell: float) -> Task:
     """Turn one joint both ways at each speed."""
-    rates_deg = np.outer(np.atleast_1d(speeds_deg), (1, -1)).ravel()
-    return lambda builder: builder.move(at_deg).spin(np.outer(rates_deg, np.arange(builder.n_joints) == joint), dwell)
+    rates_deg = np.outer(speeds_deg, (1, -1)).reshape(-1, 1)
+    return lambda builder: builder.move(at_deg).spin(np.where(np.arange(builder.n_joints) == joint, rates_deg, 0.0), dwell)
 
 
 def swing(axis: int, amplitude_deg: float, frequency: float, *, duration: float) -> Task:

@@ -1,23 +1,22 @@
-"""Simulated sessions: an IMU made of the catalogue's effects on a table that follows a profile, or on the motion of a recording."""
+"""Simulated sessions: an IMU made of the catalogue's effects on a table that follows a profile or trajectories."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.forward_equations import clip, predict
+from imu_calibration.effects.forward_equations import References, clip, predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.signal_history import HALF_WIDTH, BandVariance
+from imu_calibration.kinematics.rotations import lever_matrix
+from imu_calibration.kinematics.signal_history import HALF_WIDTH
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window, WindowKind, all_samples, chunks
-from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import Profile
-from imu_calibration.simulation.sensor_noise import GRADES, ImuNoise, SimulatedNoise, gauss_markov, jitter_stamps, read_encoders
+from imu_calibration.simulation.sensor_noise import GRADES, Cause, Felt, ImuNoise, SimulatedNoise, jitter_stamps, read_encoders
+from imu_calibration.simulation.table_controller import TableController
 
 LOUDEST = 0.25
 """Rms of the machine's vibration on each axis in its loudest gear, m/s^2."""
@@ -40,17 +39,19 @@ def hum_and_variance(time: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndar
 
     """
     loudness = LOUDEST * np.array(GEAR_AMPLITUDES)[(np.asarray(time) // GEAR_SECONDS).astype(int) % len(GEAR_AMPLITUDES)][:, None]
-    return loudness * _unit_hum(time, rate), np.tile(loudness**2, 3)
+    return loudness * unit_hum(time, rate), np.tile(loudness**2, 3)
 
 
-def _unit_hum(time, rate):
-    """Return a sine of unit variance on each axis, shape (n, 3)."""
+def unit_hum(time: np.ndarray, rate: float) -> np.ndarray:
+    """Return a sine of unit variance on each axis at times in s, shape (n, 3), for samples per second."""
     return np.sqrt(2.0) * np.sin(2 * np.pi * ALIASED * rate * time[:, None] + np.arange(3.0))
 
 
 SESSION_START_NS = 1_700_000_000_000_000_000
 """First stamp of simulated sessions: arbitrary but fixed, so that the same seed gives the same bytes."""
 SIMULATED_BLOCK_SAMPLES = 100_000
+TEMPERATURE_RATE = 1.0
+"""Temperatures per second of a live simulation."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,104 @@ def hidden_effect(model: SensorModel, name: str, seed: int = 0, *, share: float 
     return sensor, values
 
 
+@dataclass(frozen=True, eq=False)
+class SimulatedBlock:
+    """Samples of a stretch of time."""
+
+    imu: ImuSamples
+    """Readings."""
+    joints: JointSamples
+    """Joint states."""
+    temperature: TemperatureSamples | None
+    """Temperatures, when the simulation has them."""
+    truth: ImuSamples
+    """True specific force and rate at the origin of the arms, at the stamps of `imu`."""
+
+
+class LiveSimulation:
+    """
+    The forward model with noise that is continuous across blocks.
+
+    Parameters
+    ----------
+    model, values : SensorModel, ndarray
+        The true IMU, table and clock.
+    table : Table
+        The table as its description says.
+    motion : object
+        ``at(time) -> JointMotion``.
+    options : SimulationOptions
+        Rates, noise, temperature.
+    seed : int
+    start_ns : int
+        Stamp of time zero.
+    causes : sequence of Cause
+        Further faults of the IMU (`hidden_causes`).
+    drawn : bool
+        As for `ImuNoise`.
+
+    """
+
+    def __init__(self, model: SensorModel, values: np.ndarray, table: Table, *, motion: TableController | Profile,
+                 options: SimulationOptions = SimulationOptions(), seed: int = 0, start_ns: int = SESSION_START_NS,
+                 causes: Sequence[Cause] = (), drawn: bool = True):
+        self.model, self.values, self.table, self.motion, self.options = model, values, table, motion, options
+        self.start_ns, self.causes = start_ns, tuple(causes)
+        self._rng = np.random.default_rng([seed, 3])
+        self._n = {'imu': 0, 'joints': 0, 'temperature': 0}
+        self._noise = ImuNoise(options.noise, sample_rate=options.imu_rate, rng=self._rng, drawn=drawn)
+
+    def take(self, until: float) -> SimulatedBlock:
+        """Return the samples from the end of the last block to `until` (s, exclusive)."""
+        return self.at(self._times('imu', self.options.imu_rate, 0.0, until), self._times('joints', self.options.joint_rate, 0.5, until),
+                       self._times('temperature', TEMPERATURE_RATE, 0.0, until))
+
+    def _times(self, stream, rate, offset, until):
+        """Return the times of a stream's next samples before `until`, s."""
+        first = self._n[stream]
+        stop = max(int(np.ceil(until * rate - offset)), first)
+        self._n[stream] = stop
+        return (np.arange(first, stop) + offset) / rate
+
+    def at(self, imu_time: np.ndarray, joint_time: np.ndarray, temperature_time: np.ndarray) -> SimulatedBlock:
+        """Return the samples at the times of each stream, s."""
+        imu, truth = self._imu(imu_time)
+        motion, warmth = self.motion.at(joint_time), temperature_at(temperature_time, self.options)
+        position = read_encoders(motion.position, self.options.noise, self._rng)
+        velocity = motion.rate if self.options.with_velocity else np.full_like(motion.rate, np.nan)
+        joints = JointSamples(self._stamps(motion.time), position, velocity, tuple(self.table.joint_names))
+        return SimulatedBlock(imu, joints, None if warmth is None else TemperatureSamples(self._stamps(temperature_time), warmth), truth)
+
+    def _stamps(self, time):
+        return self.start_ns + np.round(time * 1e9).astype(np.int64)
+
+    def _imu(self, time):
+        if not len(time):
+            empty = ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), self.options.frame_id)
+            return empty, empty
+        parts = zip(*(self._felt(time[k:k + SIMULATED_BLOCK_SAMPLES]) for k in range(0, len(time), SIMULATED_BLOCK_SAMPLES)))
+        felt = Felt(*map(np.concatenate, parts))
+        noisy = self._noise.add(felt.force, felt.rate)
+        force, rate = (clip(self.model, sensor, self.values, output=output) for sensor, output in zip(SENSORS, noisy))
+        stamps = jitter_stamps(self._stamps(time), self.options.noise.stamp_jitter, self._rng)
+        return (ImuSamples(stamps, force, rate, self.options.frame_id),
+                ImuSamples(stamps, felt.true_force, felt.true_rate, self.options.frame_id))
+
+    def _felt(self, time):
+        """Return true motion and outputs of the sensors without noise."""
+        motion = self.motion.at(time)
+        references = References(self.model, self.table, motion)
+        accelerometer, gyroscope = (references.at(sensor) for sensor in SENSORS)
+        true_force, arm = accelerometer.force_s, self.model.value('accelerometer', Role.ARM, self.values)
+        if arm is not None:
+            true_force = true_force + lever_matrix(accelerometer.rate_s, accelerometer.alpha_s) @ arm
+        felt = Felt(true_force, gyroscope.rate_s, *answered(self.model, self.values, self.table, motion=motion, time=time,
+                                                            options=self.options))
+        for cause in self.causes:
+            felt = cause(felt)
+        return felt
+
+
 def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: Profile, options: SimulationOptions = SimulationOptions(),
              seed: int = 0) -> tuple[ImuSamples, JointSamples, TemperatureSamples | None]:
     """
@@ -134,38 +233,10 @@ def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: P
     (ImuSamples, JointSamples, TemperatureSamples or None)
 
     """
-    rng = np.random.default_rng([seed, 3])
     n_imu, n_joint = (int(profile.duration * rate) for rate in (options.imu_rate, options.joint_rate))
-    time = np.arange(n_imu) / options.imu_rate
-    noisy = ImuNoise(options.noise, sample_rate=options.imu_rate, rng=rng).add(*_outputs(model, values, table, profile, time, options))
-    force, rate = (clip(model, sensor, values, output=output) for sensor, output in zip(SENSORS, noisy))
-    stamps = jitter_stamps(stamps_at(time), options.noise.stamp_jitter, rng)
-    imu = ImuSamples(stamps, force, rate, options.frame_id)
-    joints = joint_samples(profile.at((np.arange(n_joint) + 0.5) / options.joint_rate), table, options, start_ns=SESSION_START_NS, rng=rng)
-    seconds = np.arange(0, profile.duration)
-    warmth = temperature_at(seconds, options)
-    return imu, joints, None if warmth is None else TemperatureSamples(stamps_at(seconds), warmth)
-
-
-def joint_samples(motion: JointMotion, table: Table, options: SimulationOptions, *, start_ns: int,
-                  rng: np.random.Generator) -> JointSamples:
-    """Return a motion as its encoders measure it; `start_ns` is the stamp of time zero."""
-    position = read_encoders(motion.position, options.noise, rng)
-    velocity = motion.rate if options.with_velocity else np.full_like(motion.rate, np.nan)
-    return JointSamples(stamps_at(motion.time, start_ns), position, velocity, tuple(table.joint_names))
-
-
-def stamps_at(time: np.ndarray, start_ns: int = SESSION_START_NS) -> np.ndarray:
-    """Return the stamps of times, s; `start_ns` is the stamp of time zero."""
-    return start_ns + np.round(time * 1e9).astype(np.int64)
-
-
-def _outputs(model, values, table, profile, time, options):
-    parts = []
-    for start in range(0, len(time), SIMULATED_BLOCK_SAMPLES):
-        now = time[start:start + SIMULATED_BLOCK_SAMPLES]
-        parts.append(answered(model, values, table, motion=profile.at(now), time=now, options=options))
-    return tuple(np.concatenate(sensor) for sensor in zip(*parts))
+    block = LiveSimulation(model, values, table, motion=profile, options=options, seed=seed, drawn=False).at(
+        np.arange(n_imu) / options.imu_rate, (np.arange(n_joint) + 0.5) / options.joint_rate, np.arange(0, profile.duration))
+    return block.imu, block.joints, block.temperature
 
 
 def answered(model: SensorModel, values: np.ndarray, table: Table, *, motion: JointMotion, time: np.ndarray,
@@ -186,101 +257,3 @@ def temperature_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray |
     if options.temperature_start_c is None:
         return None
     return options.temperature_start_c + options.temperature_rise_c * (1 - np.exp(-time / options.temperature_time))
-
-
-BIAS_TIME = 100.0
-"""Correlation time of the bias process where it is not identified, s."""
-
-
-class ReplayNoise(NamedTuple):
-    """Noise of one sensor in a recording."""
-
-    white_sd: np.ndarray
-    """Standard deviation of a sample, m/s^2 or rad/s, shape (3,)."""
-    bias_sd: np.ndarray
-    """Standard deviation of the bias process, shape (3,)."""
-    bias_time: float = BIAS_TIME
-    """Correlation time of the bias process, s."""
-
-
-def predict_windows(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return sensor -> output of a model without noise at the samples of some windows, m/s^2 and rad/s, shape (n, 3)."""
-    motion, temperature, rows = all_samples(windows)
-    if temperature is None and model.needs_temperature:
-        raise InputError('a model with thermal effects requires the temperature of every sample, the recording has none for some; '
-                         'name the temperature topic', key='temperature_topic', code='temperature_missing')
-    outputs = predict(model, values, table, motion=motion, temperature_c=temperature)
-    return {sensor: output[rows] for sensor, output in zip(SENSORS, outputs)}
-
-
-def noise_at_rest(windows: Sequence[Window]) -> dict[str, ReplayNoise]:
-    """
-    Return sensor -> noise of a recording: median over the windows at rest of their white noise, and no bias process.
-
-    Raises
-    ------
-    InputError
-        When no window is at rest.
-
-    """
-    found = [window.noise_sd for window in windows if window.kind is WindowKind.STATIC]
-    if not found:
-        raise InputError('the noise must be in the statistics of the calibration, or a rest in the recording; both are missing; '
-                         'calibrate from a recording with rests', key='calibration', code='noise_unknown')
-    return {sensor: ReplayNoise(white, np.zeros(3)) for sensor, white in zip(SENSORS, np.median(found, axis=0))}
-
-
-def replay(blocks: Iterable[SampleBlock], table: Table, model: SensorModel, *, values: np.ndarray,
-           noise: Mapping[str, ReplayNoise] | None = None, seed: int = 0) -> tuple[SampleBlock, int]:
-    """
-    Return (the recording with simulated readings, number of its samples without known motion, which are left out).
-
-    Parameters
-    ----------
-    blocks : iterable of SampleBlock
-        The recording.
-    table : Table
-        The reference that its joints move.
-    model, values : SensorModel, ndarray
-        The simulated IMU.
-    noise : mapping, optional
-        Sensor -> ReplayNoise; default the noise at rest of the recording.
-    seed : int
-        Of the noise.
-
-    Raises
-    ------
-    InputError
-        When no sample has a known motion, or noise or temperature is unknown.
-
-    """
-    blocks = list(blocks)
-    windows = MotionGatherer(table, keep_unused=True).all_of(blocks)
-    if not windows:
-        raise InputError('a replay requires IMU samples between joint states of the table, none was found; check the topics and the stamps',
-                         code='no_motion')
-    outputs = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
-    stamps = np.concatenate([window.stamp_ns for window in windows])
-    period = float(np.median([window.period for window in windows if len(window) > 1] or [1.0]))
-    noise, rng = noise or noise_at_rest(windows), np.random.default_rng([seed, 3])
-    exact = {sensor: np.concatenate([output[sensor] for output in outputs]) for sensor in SENSORS}
-    if model.uses('vibration'):   # biases follow the vibration of the readings
-        known = [np.asarray(motion.vibration)[rows] for motion, _, rows in map(all_samples, chunks(windows))]
-        variance = np.concatenate(known)
-        unit = _unit_hum(period * np.arange(len(variance)), 1.0 / period)
-        exact['accelerometer'] += unit * np.sqrt(variance / BandVariance().of(period, unit)[-1])
-    readings = []
-    for sensor in SENSORS:
-        own, shape = noise[sensor], exact[sensor].shape
-        noisy = exact[sensor] + rng.normal(0.0, own.white_sd, shape)
-        noisy += gauss_markov(own.bias_sd, own.bias_time, period, shape=shape, rng=rng)
-        readings.append(clip(model, sensor, values, output=noisy))
-    frame = next(block.imu.frame_id for block in blocks if block.imu is not None and len(block.imu))
-    joints, temperature = (_joined([getattr(block, name) for block in blocks]) for name in ('joints', 'temperature'))
-    lost = sum(len(block.imu) for block in blocks if block.imu is not None) - len(stamps)
-    return SampleBlock(ImuSamples(stamps, readings[0], readings[1], frame), joints, temperature), lost
-
-
-def _joined(parts):
-    parts = [part for part in parts if part is not None and len(part)]
-    return type(parts[0]).concatenate(parts) if parts else None

@@ -19,9 +19,10 @@ from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.replay import BIAS_TIME, ReplayNoise
+from imu_calibration.simulation.replay import replay as run_replay
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.simulation.session import BIAS_TIME, ReplayNoise, SimulationOptions, hidden_effect, random_values
-from imu_calibration.simulation.session import replay as run_replay
+from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values
 from imu_calibration.simulation.session import simulate as run_session
 from imu_calibration.use_cases.choices import Choices, catalogue_of, check_names, topics_of
 from imu_calibration.use_cases.recordings import name_of, source_of

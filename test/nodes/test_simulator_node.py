@@ -9,10 +9,9 @@ import pytest
 from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
-from imu_calibration.simulation.live import LiveSimulation
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import CAUSES, Felt, SimulatedNoise, hidden_causes
-from imu_calibration.simulation.session import SimulationOptions, simulate
+from imu_calibration.simulation.session import LiveSimulation, SimulationOptions, simulate
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController, braking_from, trajectory_from
 from msg_adapters.write import write_session
 

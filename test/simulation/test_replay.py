@@ -12,8 +12,9 @@ from imu_calibration.document import files
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.signal_history import BandVariance
 from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.replay import ReplayNoise, replay
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
-from imu_calibration.simulation.session import ReplayNoise, SimulationOptions, random_values, replay, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 from imu_calibration.use_cases import simulate as use_case
 from imu_calibration.use_cases.resources import config_file
 

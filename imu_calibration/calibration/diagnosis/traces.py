@@ -16,7 +16,7 @@ from imu_calibration.preprocessing.window import StoredWindows, Window, all_samp
 from imu_calibration.selection.gain import MEASURES, OF_MODEL, Gain, gain_of
 from imu_calibration.selection.residual_blocks import block_means, residuals
 from imu_calibration.selection.saturation import measured
-from imu_calibration.simulation.session import predict_windows
+from imu_calibration.simulation.replay import predict_windows
 
 PER_DECADE = 6
 """Frequency bands of the spectrum per decade."""
