@@ -1,6 +1,7 @@
 """``imu_calibration convert``: a text log as a bag."""
 
 from argparse import Namespace
+from dataclasses import asdict
 
 from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
 from msg_adapters.storages import identifiers
@@ -30,5 +31,5 @@ def run(options: Namespace) -> VerbResult:
         print_line(f'unused: {", ".join(log.unused)}')
     write_session(options.output, log.imu, log.joints, temperature=log.temperature, storage=options.storage)
     print_line(f'written: {options.output} ({len(log.imu)} Imu)')
-    columns = [{'quantity': c.quantity, 'joint': c.joint, 'names': c.names, 'unit': c.unit, 'origin': c.origin} for c in log.columns]
-    return VerbResult(0, {'output': str(options.output), 'count': len(log.imu), 'columns': columns, 'unused': log.unused})
+    return VerbResult(0, {'output': str(options.output), 'count': len(log.imu), 'columns': list(map(asdict, log.columns)),
+                          'unused': log.unused})

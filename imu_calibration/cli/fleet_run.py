@@ -97,12 +97,11 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
         results = mapper(FleetStep(table, settings, None if options.no_report else calibration_report), units)
         spreads = summarise(results)
         for result in results:
-            for name, text in (result.files or {}).items():
-                files.write_text(files.make_folder(folder / result.name) / name, text)
+            if result.files:
+                files.write_texts(folder / result.name, result.files)
         rows = {'summary.csv': parameter_rows(spreads), 'units.csv': unit_rows(results)}
-        for name, table in rows.items():
-            files.write_text(folder / name, csv_text(table))
-        files.write_text(folder / 'summary.html', summary_html(results, spreads))
+        files.write_texts(folder, {name: csv_text(table) for name, table in rows.items()} | {
+            'summary.html': summary_html(results, spreads)})
         show_fleet(results, spreads, folder, hints=hints_of(options))
     return VerbResult(3 if any(result.exit_code for result in results) else 0,
                       {'units': rows['units.csv'], 'parameters': rows['summary.csv']})

@@ -3,7 +3,7 @@
 import math
 import time
 from argparse import Namespace
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from imu_calibration.cli.parser import OneLineParser, VerbResult
@@ -54,8 +54,7 @@ def _watch(watcher, options):
     out = Terminal.standard()
     if options.once or options.json:
         out.write(watcher.screen(out))
-        return VerbResult(0, {'node': watcher.name, 'status': {name: {'level': s.level, 'message': s.message, 'values': s.values}
-                                                            for name, s in watcher.statuses.items()}})
+        return VerbResult(0, {'node': watcher.name, 'status': {name: asdict(status) for name, status in watcher.statuses.items()}})
     drawn = out.redraw(watcher.screen(out), 0)
     while time.monotonic() - watcher.heard < GONE:
         watcher.spin(WATCH_PERIOD_SECONDS)

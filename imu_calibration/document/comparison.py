@@ -119,13 +119,11 @@ def _groups(names, difference, covariance, held):
         if not index.any():
             continue
         block, d = covariance[np.ix_(index, index)], difference[index]
-        if not np.any(d):
-            found.append((key, 0.0, int(index.sum()), 1.0))
-            continue
         scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
-        chi2 = float((d / scale) @ np.linalg.pinv(block / np.outer(scale, scale), rcond=1e-9, hermitian=True) @ (d / scale))
-        rank = int(np.linalg.matrix_rank(block / np.outer(scale, scale), tol=1e-9, hermitian=True))
-        found.append((key, chi2, max(rank, 1), float(chdtrc(max(rank, 1), chi2))))
+        correlation = block / np.outer(scale, scale)
+        chi2 = float((d / scale) @ np.linalg.pinv(correlation, rcond=1e-9, hermitian=True) @ (d / scale))
+        rank = max(int(np.linalg.matrix_rank(correlation, tol=1e-9, hermitian=True)), 1)
+        found.append((key, chi2, rank, float(chdtrc(rank, chi2))))
     return found
 
 

@@ -4,7 +4,7 @@ import hashlib
 import io
 import os
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from errno import EISDIR
 from functools import lru_cache
@@ -173,6 +173,13 @@ def output_folder(path: str) -> Iterator[Path]:
 def write_text(path: str | PathLike[str], text: str) -> None:
     """Write a text file atomically; raises as `write_whole`."""
     write_whole(path, text.encode(), to_disk=False)
+
+
+def write_texts(folder: str | PathLike[str], texts: Mapping[str, str]) -> None:
+    """Write {name: text} into a folder, which is made; raises as `make_folder` and `write_whole`."""
+    place = make_folder(folder)
+    for name, text in texts.items():
+        write_text(place / name, text)
 
 
 def hash_of(path: str | PathLike[str]) -> str:

@@ -209,8 +209,8 @@ def refused_sensors(calibration: Calibration, *, anyway: bool = False, live: boo
 
 def _mostly_undetermined(calibration, sensor):
     """Return why an unproven sensor is not applied even with consent; '' where it may be."""
-    status = [calibration.status[place] for effect in calibration.model.effects if effect.sensor == sensor
-              for place in range(*calibration.model.slices[effect.key].indices(len(calibration.status)))]
+    status = [known for effect in calibration.model.effects if effect.sensor == sensor
+              for known in calibration.status[calibration.model.slices[effect.key]]]
     missing = sum(each in LACKING for each in status)
     return f'unproven, and {missing} of {len(status)} parameters are not determined' \
         if calibration.decisions[sensor] is UNPROVEN and 2 * missing > len(status) else ''

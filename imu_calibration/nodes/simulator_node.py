@@ -11,7 +11,6 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from rclpy.node import Node
@@ -24,7 +23,6 @@ from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.document.calibration import true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.kinematics.motion_limits import limits_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
@@ -35,9 +33,10 @@ from imu_calibration.nodes.playback import PLAYBACK_DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import CAUSES, GRADES, hidden_causes
-from imu_calibration.simulation.session import LiveSimulation, SimulationOptions, random_values
+from imu_calibration.simulation.session import LiveSimulation, SimulationOptions
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 from imu_calibration.use_cases.resources import config_file
+from imu_calibration.use_cases.simulate import true_imu
 from msg_adapters.joint_state import trajectory_from_message
 from msg_adapters.layout import Packed
 from msg_adapters.write import encode_imu, encode_joints, encode_temperature
@@ -100,9 +99,11 @@ class SimulatorNode(Node):
         announce(self, ['joint_trajectory'], ['imu/data_raw', 'joint_states', *['imu/temperature'] * settings.temperature,
                                               *['imu/truth'] * settings.truth, *['/clock'] * settings.clock])
         self._table, self._motion = self._make_table()
-        model, values = self._true_imu()
+        imu_seed = settings.seed if settings.imu_seed < 0 else settings.imu_seed
+        truth_file = files.user_path(settings.calibration_file) if settings.calibration_file else None
+        model, values = true_imu(self._table, truth_file, settings.grade, seed=imu_seed)
         start_ns = int(settings.start_time * 1e9) or time.time_ns()
-        causes = hidden_causes(settings.hide.split('+') if settings.hide else [], self._imu_seed(), settings.hide_size)
+        causes = hidden_causes(settings.hide.split('+') if settings.hide else [], imu_seed, settings.hide_size)
         self._simulation = LiveSimulation(model, values, self._table, motion=self._motion, options=self._options(), seed=settings.seed,
                                           start_ns=start_ns, causes=causes)
         self._trajectories = queue.Queue()
@@ -141,17 +142,6 @@ class SimulatorNode(Node):
             table = Table.from_mapping(profile.table)
         return table, TableController(profile, table.joint_names, limits=limits_of(table), settings=self._controller,
                                       repeat=settings.repeat)
-
-    def _imu_seed(self):
-        return self.settings.seed if self.settings.imu_seed < 0 else self.settings.imu_seed
-
-    def _true_imu(self):
-        settings = self.settings
-        if settings.calibration_file:
-            calibration = files.read_calibration(Path(settings.calibration_file).expanduser())
-            return calibration.model, calibration.values
-        model = SensorModel(NAMED_MODELS['size_effect'], joint_names=self._table.joint_names)
-        return model, random_values(model, settings.grade, self._imu_seed())
 
     def _options(self):
         settings = self.settings

@@ -78,12 +78,16 @@ def _causes(diagnosis):
 
 def explained_share(values: np.ndarray, signal: np.ndarray) -> float:
     """Return the share of the variance of `signal` that its means over bins of `values` carry."""
-    edges = np.quantile(values, np.linspace(0, 1, BINS + 1)[1:-1])
-    index = np.searchsorted(edges, values)
-    count = np.bincount(index, minlength=BINS)
-    means = np.bincount(index, signal, BINS) / np.maximum(count, 1)
+    count, means = _binned(np.quantile(values, np.linspace(0, 1, BINS + 1)[1:-1]), values, signal)
     total = np.sum((signal - signal.mean())**2)
     return float(np.sum(count * (means - signal.mean())**2) / total) if total > 0 else 0.0
+
+
+def _binned(edges, values, *signals):
+    """Return the numbers of values between edges, and the mean of each signal there."""
+    index = np.searchsorted(edges, values)
+    count = np.bincount(index, minlength=BINS)
+    return count, *(np.bincount(index, signal, BINS) / np.maximum(count, 1) for signal in signals)
 
 
 def cause_of(diagnosis: Diagnosis, sensor: str, against: Sequence[str]) -> tuple[int, str, np.ndarray]:
@@ -129,11 +133,8 @@ def _curve(values, signal):
     if len(values) < FEW:
         order = np.argsort(values)
         return values[order], signal[order]
-    edges = np.linspace(values.min(), values.max(), BINS + 1)[1:-1]
-    index = np.searchsorted(edges, values)
-    count = np.bincount(index, minlength=BINS)
-    filled = count >= max(3, 0.002 * len(values))
-    return tuple(np.bincount(index, column, BINS)[filled] / count[filled] for column in (values, signal))
+    count, *means = _binned(np.linspace(values.min(), values.max(), BINS + 1)[1:-1], values, values, signal)
+    return tuple(mean[count >= max(3, 0.002 * len(values))] for mean in means)
 
 
 def _over_time(figure, traces, over):

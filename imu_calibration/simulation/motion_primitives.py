@@ -38,7 +38,7 @@ def spin_vertical(up_b: np.ndarray, speeds_deg: ArrayLike, dwell: float) -> Task
 
 def spin_joint(joint: int, at_deg: ArrayLike, speeds_deg: ArrayLike, *, dwell: float) -> Task:
     """Turn one joint both ways at each speed."""
-    rates_deg = np.outer(speeds_deg, (1, -1)).reshape(-1, 1)
+    rates_deg = np.multiply.outer(speeds_deg, (1, -1)).reshape(-1, 1)
     return lambda builder: builder.move(at_deg).spin(np.where(np.arange(builder.n_joints) == joint, rates_deg, 0.0), dwell)
 
 

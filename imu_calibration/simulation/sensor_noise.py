@@ -176,11 +176,7 @@ Cause = Callable[[Felt], Felt]
 def _two_half_ranges(rng: np.random.Generator) -> Cause:
     """Each gyroscope's electrodes have different gains for the two senses of rotation, by 0.2 to 0.4 %."""
     gap = rng.uniform(2e-3, 4e-3, 3) * rng.choice([-1, 1], 3)
-
-    def answer(felt: Felt) -> Felt:
-        gain = np.where(felt.true_rate > 0, 0.5 * gap, -0.5 * gap)
-        return felt._replace(rate=felt.rate + gain * felt.true_rate)
-    return answer
+    return lambda felt: felt._replace(rate=felt.rate + 0.5 * gap * np.abs(felt.true_rate))
 
 
 def _unbalanced_mass(rng: np.random.Generator) -> Cause:
@@ -198,10 +194,7 @@ def _soft_spring(rng: np.random.Generator) -> Cause:
 def _gain_by_sense(rng: np.random.Generator) -> Cause:
     """Each accelerometer's amplifier has different gains for the two signs, by 0.05 to 0.1 %."""
     gap = rng.uniform(5e-4, 1e-3, 3) * rng.choice([-1, 1], 3)
-
-    def answer(felt: Felt) -> Felt:
-        return felt._replace(force=felt.force + np.where(felt.true_force > 0, 0.5 * gap, -0.5 * gap) * felt.true_force)
-    return answer
+    return lambda felt: felt._replace(force=felt.force + 0.5 * gap * np.abs(felt.true_force))
 
 
 def _narrow_range(rng: np.random.Generator) -> Cause:

@@ -63,10 +63,8 @@ class Calibrated:
 
     def save(self, folder: str | PathLike, *, report: bool = True) -> None:
         """Write calibration.yaml and, when wanted, report.html into a folder."""
-        text, place = calibration_to_text(self.calibration), files.make_folder(folder)
-        if report:
-            files.write_text(place / 'report.html', self.report)
-        files.write_text(place / 'calibration.yaml', text)
+        files.write_texts(folder, ({'report.html': self.report} if report else {}) | {
+            'calibration.yaml': calibration_to_text(self.calibration)})
 
     def __repr__(self):
         return repr(self.calibration)

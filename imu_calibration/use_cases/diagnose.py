@@ -68,12 +68,10 @@ class Diagnosed:
 
     def save(self, folder: str | PathLike) -> None:
         """Write diagnosis.json, report.html, the extended calibration.yaml and, with proposed formulas, extended.yaml into a folder."""
-        page, place = self.report, files.make_folder(folder)
-        files.write_text(place / 'diagnosis.json', json.dumps(self.document, indent=1) + '\n')
-        files.write_text(place / 'report.html', page)
-        files.write_text(place / 'calibration.yaml', calibration_to_text(self.calibration))
-        if self.proposed is not None:
-            files.write_text(place / 'extended.yaml', calibration_to_text(self.proposed))
+        files.write_texts(folder, {
+            'diagnosis.json': json.dumps(self.document, indent=1) + '\n', 'report.html': self.report,
+            'calibration.yaml': calibration_to_text(self.calibration),
+            **({} if self.proposed is None else {'extended.yaml': calibration_to_text(self.proposed)})})
 
     def save_overlay(self, path: str | PathLike) -> None:
         """Write measured and simulated signals, residuals, spectra and histograms as MCAP for Foxglove (`overlay_topics`)."""

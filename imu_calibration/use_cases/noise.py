@@ -51,10 +51,8 @@ class IdentifiedNoise:
 
     def save(self, folder: str | PathLike, *, report: bool = True) -> None:
         """Write noise.yaml and, when wanted, report.html into a folder."""
-        text, place = noise_to_text(self.figures, self.horizon), files.make_folder(folder)
-        if report:
-            files.write_text(place / 'report.html', self.report)
-        files.write_text(place / 'noise.yaml', text)
+        files.write_texts(folder, ({'report.html': self.report} if report else {}) | {
+            'noise.yaml': noise_to_text(self.figures, self.horizon)})
 
     def __str__(self):
         return '\n'.join(lines(self.figures))

@@ -7,6 +7,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Unpack, cast
 
+import numpy as np
+
 from imu_calibration.core import documents
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import report
@@ -15,7 +17,7 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration, true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.catalogue import Catalogue
+from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
@@ -101,7 +103,7 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
     given = table_of(table or config_file('table_simulated.yaml'))
     motion = make_profile(profile, seed, given, duration=duration)
     mover = given if motion.table is None else Table.from_mapping(motion.table)
-    model, values = _truth(mover, calibration, grade, seed if imu_seed is None else imu_seed, catalogue_of(catalogue))
+    model, values = true_imu(mover, calibration, grade, seed=seed if imu_seed is None else imu_seed, catalogue=catalogue_of(catalogue))
     for name in effects:
         sensor, hidden = hidden_effect(model, name, seed, share=size, moment=0.6 * motion.duration)
         model, values = replace(model, point={}).with_sized_effect(values, sensor, name, size=hidden)
@@ -158,8 +160,9 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
     return Simulated(samples, given, truth, 1e-9 * float(stamps[-1] - stamps[0]), lost)
 
 
-def _truth(table, calibration, grade, seed, catalogue):
-    """Return (model, values) of the true IMU."""
+def true_imu(table: Table, calibration: str | PathLike | Calibration | None, grade: str, *, seed: int,
+             catalogue: Catalogue = CATALOGUE) -> tuple[SensorModel, np.ndarray]:
+    """Return (model, values) of a calibration, or of a random IMU of a grade with size effect."""
     if calibration is None:
         model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names, catalogue=catalogue)
         return model, random_values(model, grade, seed)

@@ -223,9 +223,6 @@ def _from_x(along):
     return turn / np.linalg.norm(turn) if turn[3] > 1e-9 else np.array([0.0, 0.0, 1.0, 0.0])
 
 
-OVERLAY, OVERLAY_RESIDUAL, OVERLAY_SPECTRUM, HISTOGRAM = '/overlay', '/residual', '/residual_spectrum', '/residual_histogram'
-
-
 def overlay_topics(traces: Traces, joint_names: Sequence[str]) -> Iterator[tuple[str, list[tuple[float, Any]]]]:
     """
     Yield the topics of `mcap_bytes` for a diagnosis.
@@ -239,17 +236,17 @@ def overlay_topics(traces: Traces, joint_names: Sequence[str]) -> Iterator[tuple
         for axis, segment in zip(AXES, traces.segments.get(sensor, ())):
             names = [name.replace(' ', '_') for name in segment.signals]
             rows = np.column_stack(list(segment.signals.values()))
-            yield f'{OVERLAY}/{sensor}/{axis}', [(time, dict(zip(names, row))) for time, row in zip(segment.time.tolist(), rows.tolist())]
-        yield (f'{OVERLAY_RESIDUAL}/{sensor}',
+            yield f'/overlay/{sensor}/{axis}', [(time, dict(zip(names, row))) for time, row in zip(segment.time.tolist(), rows.tolist())]
+        yield (f'/residual/{sensor}',
                [(float(traces.time[k]), _residual(traces, sensor, joint_names, k)) for k in range(len(traces.time))])
         if sensor in traces.distances:
             frequency, density, noise = traces.distances[sensor].density()
-            yield f'{OVERLAY_SPECTRUM}/{sensor}', [(time, {'frequency': frequency.tolist(), 'noise': _by_axis(noise),
+            yield f'/residual_spectrum/{sensor}', [(time, {'frequency': frequency.tolist(), 'noise': _by_axis(noise),
                                                    **{when: _by_axis(own) for when, own in zip(WHEN, density)}}) for time in (0.0, end)]
         for k, axis in enumerate(AXES):
             middles, counts = histogram({when: getattr(traces, when)[sensor][:, k] for when in WHEN})
             content = {'residual': middles.tolist(), **{when: own.tolist() for when, own in counts.items()}}
-            yield f'{HISTOGRAM}/{sensor}/{axis}', [(time, content) for time in (0.0, end)]
+            yield f'/residual_histogram/{sensor}/{axis}', [(time, content) for time in (0.0, end)]
 
 
 def _residual(traces, sensor, joint_names, k):
