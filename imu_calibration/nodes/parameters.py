@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 
-from imu_calibration.core.errors import ImuCalibrationError, InputError, did_you_mean
+from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.settings import Setting, describe, override
 
 UNKNOWN_PARAMETER = 'is unknown and ignored'
@@ -142,8 +143,9 @@ def unknown_parameters(node: Node) -> list[str]:
     for name in sorted(given):
         if node.has_parameter(name) or name.startswith(NOT_OURS):
             continue
-        near = did_you_mean(name, node.get_parameters_by_prefix(''))
-        lines.append(f"parameter '{name}' {UNKNOWN_PARAMETER}{near or f'; see ros2 param list {node.get_fully_qualified_name()}'}")
+        near = get_close_matches(name, node.get_parameters_by_prefix(''), 1)
+        lines.append(f"parameter '{name}' {UNKNOWN_PARAMETER}" + (f"; did you mean '{near[0]}'?" if near else
+                                                                     f"; see 'ros2 param list {node.get_fully_qualified_name()}'"))
     return lines
 
 

@@ -20,6 +20,8 @@ LABELS = ('serial', 'operator')
 """Options that name the IMU and the person."""
 STANDS = ('table', 'urdf', 'site')
 """Options with the files of the reference."""
+SHORT_HASH_DIGITS = 16
+"""Hexadecimal digits of the hashes that earlier versions wrote."""
 
 
 def provenance_with(verb: str, recordings: Iterable[str | PathLike | SampleBlock], choices: Choices | Mapping[str, Any], *,
@@ -61,8 +63,8 @@ def _named(option):
 
 
 def made_from(found: Mapping[str, Any]) -> set[str]:
-    """Return the hashes of the recordings of a provenance."""
-    return {str(bag.get('sha256')) for bag in found.get('bags') or () if isinstance(bag, Mapping)}
+    """Return the hashes of the recordings of a provenance, as many digits as all versions write."""
+    return {str(bag.get('sha256'))[:SHORT_HASH_DIGITS] for bag in found.get('bags') or () if isinstance(bag, Mapping)}
 
 
 def require_same_inputs(folder: str | PathLike, found: Mapping[str, Any]) -> None:

@@ -96,8 +96,9 @@ def numbers_autoware(imu: AffineImu) -> dict:
 
 def imu_autoware(found: dict) -> AffineImu:
     """Return the IMU of such numbers."""
-    scale = np.asarray(found[SCALE_KEY])
-    return undone({'gyroscope': (np.diag(1.0 / scale), np.array([found[f'angular_velocity_offset_{a}'] for a in AXES]) / scale)})
+    offset = np.array([found[f'angular_velocity_offset_{a}'] for a in AXES])
+    return AffineImu(bias={'accelerometer': np.zeros(3), 'gyroscope': offset},
+                     matrix={'accelerometer': np.eye(3), 'gyroscope': np.diag(found[SCALE_KEY])})
 
 
 def noise_autoware(found: Noise) -> dict:
