@@ -20,6 +20,7 @@ from imu_calibration.nodes import calibration_node  # noqa: E402
 from imu_calibration.nodes.calibration_node import CalibrationNode  # noqa: E402
 from imu_calibration.nodes.calibration_status import advice_of  # noqa: E402
 from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
+from imu_calibration.preprocessing.window import WindowSettings  # noqa: E402
 
 from ros.live_station import TABLE  # noqa: E402
 
@@ -176,7 +177,7 @@ def test_parameters_change_while_it_runs_or_say_why_not(bench, tmp_path):
     line, = unknown_parameters(node)
     assert "'setling'" in line and "'settling'" in line
     assert node.set_parameters([Parameter('settling', value=2.0)])[0].successful
-    assert node._options.windows.settling == 2.0
+    assert node._session[WindowSettings].settling == 2.0
     for name, value in (('model_as_asked', True), ('accelerometer_model', 'bias')):
         answer = node.set_parameters([Parameter(name, value=value)])[0]
         assert not answer.successful and name in answer.reason and node.get_parameter(name).value != value
