@@ -60,11 +60,8 @@ def choose_derivative(period: float, rate_sd: float, arm: float, *, force_sd: fl
     longest = max(2, int(2 * MAX_DERIVATIVE_DELAY / period) + 1)
     if not (rate_sd > 0 and force_sd > 0):
         return CausalDerivative((longest + 2) // 2, period)
-    for taps in range(2, longest + 1):
-        derivative = CausalDerivative(taps, period)
-        if derivative.noise_sd(rate_sd) * arm <= force_sd / 3:
-            return derivative
-    return CausalDerivative(longest, period)
+    candidates = [CausalDerivative(taps, period) for taps in range(2, longest + 1)]
+    return next((each for each in candidates if each.noise_sd(rate_sd) * arm <= force_sd / 3), candidates[-1])
 
 
 RESET_NS = 1_000_000_000

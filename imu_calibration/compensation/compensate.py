@@ -12,7 +12,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.kinematics.rotations import Reference, lever_matrix
+from imu_calibration.kinematics.rotations import Reference, lever_matrix, rotation_from_rpy
 
 
 class FittedErrors(Protocol):
@@ -107,7 +107,7 @@ class Transfer:
         if len(xyz) != 3 or len(rpy) != 3 or not np.all(np.isfinite([*xyz, *rpy])):
             raise InputError(f'the pose of the sensor must be three finite numbers each, got xyz {list(xyz)} and rpy {list(rpy)}; '
                              'correct it', code='pose_numbers')
-        return cls(frame_id, Rotation.from_euler('xyz', rpy).as_matrix(), np.asarray(xyz, float))
+        return cls(frame_id, rotation_from_rpy(np.asarray(rpy)), np.asarray(xyz, float))
 
     def is_close(self, other: 'Transfer | None') -> bool:
         """Return whether another transfer has the same frames and, within a micrometre and a microradian, the same pose."""

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple
 
 import numpy as np
 
@@ -71,8 +70,9 @@ class StopDetector:
         self._noise_sd = np.asarray(noise_sd, float)
         self._most_variance = (MOST_SHAKE + 4 * self._noise_sd)**2
         self._rest: np.ndarray = np.zeros((0, 1))
-        self._blocks: list[tuple[float, float, int, np.ndarray, np.ndarray]] = []
-        self._stand: list[tuple[float, float, int, np.ndarray, np.ndarray]] = []
+        self._blocks: list[np.ndarray] = []
+        """Start, end, samples, means of the columns, variances of force and rate; shape (3 + 6 + k + 6,) each."""
+        self._stand: list[np.ndarray] = []
         self._stop: Stop | None = None
 
     def push(self, rows: np.ndarray) -> Stop | None:
@@ -97,43 +97,36 @@ class StopDetector:
         """Process one block, or restart after a gap."""
         if self._blocks and rows[0, 0] - self._blocks[-1][1] > HEALTH_BLOCK_SECONDS:
             self._blocks, self._stand = [], []
-        block = (rows[0, 0], rows[-1, 0], len(rows), rows[:, 1:].mean(axis=0), rows[:, 1:7].var(axis=0))
+        block = np.concatenate([[rows[0, 0], rows[-1, 0], len(rows)], rows[:, 1:].mean(axis=0), rows[:, 1:7].var(axis=0)])
         self._blocks = [*self._blocks[-N_BLOCKS + 1:], block]
-        if not self._may_be_still(*block[3:]) or not self._is_still():
+        if not self._may_be_still(block) or not self._is_still():
             self._stand = []
         elif self._stand and block[1] - self._stand[0][0] <= MAX_STOP_SECONDS:
             self._stand.append(block)
         else:
             self._stand = [block] if self._stand else list(self._blocks)
-        self._stop = self._stop_of(self._stand) if self._stand else None
+        self._stop = _stop_of(np.array(self._stand)) if self._stand else None
 
-    def _may_be_still(self, mean, variance):
+    def _may_be_still(self, block):
         """Return whether a block turns and shakes little enough by itself; most blocks of a robot that drives do not."""
-        wx, wy, wz = mean[3:6].tolist()
-        return wx * wx + wy * wy + wz * wz < MOST_RATE**2 and bool((variance <= self._most_variance).all())
+        return block[6:9] @ block[6:9] < MOST_RATE**2 and bool((block[-6:] <= self._most_variance).all())
 
     def _is_still(self):
         if len(self._blocks) < N_BLOCKS:
             return False
-        shake = np.sqrt(np.max([variance for *_, variance in self._blocks], axis=0))
-        least = min(n for _, _, n, _, _ in self._blocks)
-        apart = np.ptp([mean[:6] for _, _, _, mean, _ in self._blocks], axis=0)
+        blocks = np.array(self._blocks)
+        variance = blocks[:, -6:].max(axis=0)
         # Vibration of the robot is noise for the means as well.
-        allowed = MAX_BLOCK_CHANGE + TIMES_NOISE * np.maximum(self._noise_sd, shake) / np.sqrt(least)
-        return bool((apart <= allowed).all() and (shake**2 <= self._most_variance).all())
-
-    @staticmethod
-    def _stop_of(stand):
-        half = len(stand) // 2
-        (early, _, _), (late, shake, n) = (_mean_of(part) for part in (stand[:half] or stand, stand[half:]))
-        return Stop(stand[0][0], stand[-1][1], n, late[:6], late[6:], shake, (late - early)[:6])
+        allowed = MAX_BLOCK_CHANGE + TIMES_NOISE * np.maximum(self._noise_sd, np.sqrt(variance)) / np.sqrt(blocks[:, 2].min())
+        return bool((np.ptp(blocks[:, 3:9], axis=0) <= allowed).all() and (variance <= self._most_variance).all())
 
 
-def _mean_of(blocks):
-    """Return (mean, sd within blocks, samples) of blocks."""
-    number = np.array([n for _, _, n, _, _ in blocks])
-    share = number / number.sum()
-    return share @ [mean for *_, mean, _ in blocks], np.sqrt(share @ [variance for *_, variance in blocks]), int(number.sum())
+def _stop_of(stand):
+    """Return the `Stop` of the blocks of a rest, shape (n, 3 + 6 + k + 6)."""
+    half = len(stand) // 2
+    early, late = (np.average(part[:, 3:], axis=0, weights=part[:, 2]) for part in (stand[:half or None], stand[half:]))
+    return Stop(float(stand[0, 0]), float(stand[-1, 1]), int(stand[half:, 2].sum()), late[:6], late[6:-6], np.sqrt(late[-6:]),
+                (late - early)[:6])
 
 
 MOST_MOVED = 0.02
@@ -247,17 +240,6 @@ class HealthOptions:
     """Seconds in which an update loses its meaning."""
 
 
-class _Judged(NamedTuple):
-    """A stop with the state at its end; replaced as a whole, so that another thread may read it."""
-
-    stop: Stop
-    of_mean: np.ndarray
-    """Variance of its mean, shape (6,)."""
-    n_stops: int
-    bias_update: tuple[np.ndarray, np.ndarray] | None
-    """Corrected bias, and its variance, each shape (3,)."""
-
-
 class CalibrationHealth:
     """
     Judges stops of a stream of corrected readings.
@@ -282,7 +264,8 @@ class CalibrationHealth:
         self._gravity, self._place = float(given or STANDARD_GRAVITY), 0.1 * GRAVITY_PLACE_SHARE if options.gravity else GRAVITY_PLACE_SHARE
         self.update = GyroBiasUpdate(np.sqrt(np.diag(self._known)[3:]), options.bias_time) if options.update else None
         self._judged: float | None = None
-        self._last: _Judged | None = None
+        self._last: tuple | None = None
+        """Arguments of `_evaluated`; replaced as a whole, so that another thread may read it."""
 
     def judge(self, stop: Stop) -> None:
         """
@@ -302,7 +285,7 @@ class CalibrationHealth:
         of_mean = np.maximum(stop.shake_sd, self.noise_sd)**2 / stop.n_samples + (2 * stop.change)**2
         if self.update is not None:
             self.update.measure(stop.start, stop.end, rate=stop.mean[3:], variance=of_mean[3:])
-        self._last = _Judged(stop, of_mean, self.n_stops, None if self.update is None else self.update.predict(stop.end))
+        self._last = stop, of_mean, self.n_stops, None if self.update is None else self.update.predict(stop.end)
 
     @property
     def state(self) -> LiveState:
@@ -310,6 +293,7 @@ class CalibrationHealth:
         return LiveState(WAITING, 'no stop of two seconds yet') if self._last is None else self._evaluated(*self._last)
 
     def _evaluated(self, stop, of_mean, n_stops, bias_update):
+        """Return the state after a stop, from the variance of its mean, (6,), and the corrected bias with its variance, or None."""
         total = self._known + np.diag(of_mean)
         along = stop.mean[:3] / max(np.linalg.norm(stop.mean[:3]), 1e-9)
         rate_off = np.maximum(np.abs(stop.mean[3:]) - EARTH_RATE, 0) / np.sqrt(np.diag(total)[3:])

@@ -51,4 +51,4 @@ def chance_of_fall(fall: float, added: int, *, rest: float, spare: float) -> flo
         Its degrees of freedom.
 
     """
-    return float(fdtrc(added, spare, max(fall, 0.0) / added / max(rest / spare, 1e-12)))
+    return float(f_sf(fall / added / max(rest / spare, 1e-12), added, spare))

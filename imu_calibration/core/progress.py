@@ -58,7 +58,7 @@ def counter(phase: str, total: float) -> Callable[[float], None]:
 
 def reported(phase: str, items: Iterable[Item], total: int) -> Iterator[Item]:
     """Yield items and report how many of them are done."""
-    report(phase, 0, total)
-    for number, item in enumerate(items, 1):
+    advance = counter(phase, total)
+    for item in items:
         yield item
-        report(phase, number, total)
+        advance(1)

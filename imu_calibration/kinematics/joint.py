@@ -25,7 +25,7 @@ def require_keys(mapping: Any, known: Sequence[str], what: str) -> None:
 
 def unit_vector(value: Any, what: str) -> tuple[float, float, float]:
     """Return the direction of three numbers as a unit vector; a unit vector is returned unchanged."""
-    vector = np.array(three_numbers(value, what))
+    vector = np.array(several_numbers(value, what))
     norm = np.linalg.norm(vector)
     if norm < 1e-9:
         raise InputError(f'table: {what} must not be zero, got {list(value)}; give a direction of three numbers', code='zero_vector')
@@ -33,13 +33,7 @@ def unit_vector(value: Any, what: str) -> tuple[float, float, float]:
     return tuple((vector / norm if abs(norm - 1) > 4e-16 else vector).tolist())
 
 
-def three_numbers(value: Any, what: str) -> tuple[float, float, float]:
-    """Return three finite numbers."""
-    x, y, z = several_numbers(value, 3, what)
-    return x, y, z
-
-
-def several_numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
+def several_numbers(value: Any, what: str, count: int = 3) -> tuple[float, ...]:
     """Return `count` finite numbers."""
     words = {2: 'two', 3: 'three'}[count]
     if isinstance(value, (str, bytes)) or not hasattr(value, '__len__') or len(value) != count:
@@ -120,8 +114,8 @@ class Joint:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'axis', unit_vector(self.axis, f"axis of joint '{self.name}'"))
-        object.__setattr__(self, 'xyz', three_numbers(self.xyz, f"xyz of joint '{self.name}'"))
-        object.__setattr__(self, 'rpy_deg', three_numbers(self.rpy_deg, f"rpy_deg of joint '{self.name}'"))
+        object.__setattr__(self, 'xyz', several_numbers(self.xyz, f"xyz of joint '{self.name}'"))
+        object.__setattr__(self, 'rpy_deg', several_numbers(self.rpy_deg, f"rpy_deg of joint '{self.name}'"))
         if self.type not in TYPES:
             raise InputError(f"table: the type of joint '{self.name}' must be {' or '.join(TYPES)}, got {self.type!r}; correct it")
         _require_limits(self.limits, f"joint '{self.name}'")
@@ -227,7 +221,7 @@ def limits_from_mapping(item: Mapping, kind: str) -> JointLimits:
     range_key, *others = LIMIT_KEYS.get(kind, LIMIT_KEYS['revolute'])[:3]
     unit = np.radians(1.0) if range_key.endswith('_deg') else 1.0
     lower, upper = (None, None) if item.get(range_key) is None else (
-        unit * end for end in several_numbers(item[range_key], 2, f'{range_key} {what}'))
+        unit * end for end in several_numbers(item[range_key], f'{range_key} {what}', 2))
     endless = item.get('endless') or False
     if not isinstance(endless, bool):
         raise InputError(f'table: endless {what} must be true or false, got {endless!r}; correct it', code='not_true_or_false')

@@ -18,7 +18,7 @@ from imu_calibration.kinematics.joint import (
     joint_to_mapping,
     place_names,
     require_keys,
-    three_numbers,
+    several_numbers,
     unit_vector,
 )
 from imu_calibration.kinematics.rotations import NORMAL_GRAVITY_ACCURACY, align, normal_gravity, rotation_from_rpy
@@ -122,9 +122,9 @@ class Table:
         joints = tuple(self.joints)
         _require_joints(joints)
         checked: dict[str, Any] = {'joints': joints, 'up': unit_vector(self.up, 'up'),
-                                   'mount_rpy_deg': three_numbers(self.mount_rpy_deg, 'mount rpy_deg')}
+                                   'mount_rpy_deg': several_numbers(self.mount_rpy_deg, 'mount rpy_deg')}
         if self.mount_xyz is not None:
-            checked['mount_xyz'] = three_numbers(self.mount_xyz, 'mount xyz')
+            checked['mount_xyz'] = several_numbers(self.mount_xyz, 'mount xyz')
         for name, (low, high, advice) in _NUMBERS.items():
             value = getattr(self, name)
             checked[name] = None if value is None else finite_number(value, name, low=low, high=high, advice=advice)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from imu_calibration.core.documents import MAX_DOCUMENT_CHARACTERS
 from imu_calibration.core.errors import InputError, printable, shortened
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
-from imu_calibration.kinematics.joint import LIMIT_KEYS, Joint, JointLimits, Mimic, limits_from_mapping, require_keys, three_numbers
+from imu_calibration.kinematics.joint import LIMIT_KEYS, Joint, JointLimits, Mimic, limits_from_mapping, require_keys, several_numbers
 from imu_calibration.kinematics.rotations import rotation_from_rpy, rpy_from_rotation
 from imu_calibration.kinematics.table import Table, joint_entries, site_from_mapping
 
@@ -147,7 +147,7 @@ def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None
     if values.get('gravity') is None and values.get('latitude') is None:
         values |= {'gravity': STANDARD_GRAVITY, 'gravity_sd': values.get('gravity_sd') or STANDARD_GRAVITY_SD}
     joints, rest = _chain(robot, link)
-    xyz, rpy_deg = (three_numbers(values.get(f'mount_{name}', (0.0, 0.0, 0.0)), f'mount {name}') for name in ('xyz', 'rpy_deg'))
+    xyz, rpy_deg = (several_numbers(values.get(f'mount_{name}', (0.0, 0.0, 0.0)), f'mount {name}') for name in ('xyz', 'rpy_deg'))
     mount = rest.then(np.array(xyz), rotation_from_rpy(np.radians(rpy_deg)))
     values |= {f'mount_{name}': value for name, value in mount.fields.items()}
     return Table(**JOINT_ERRORS | values | {'joints': _with_limits(joints, joint_entries(site or {}), link)})
@@ -234,7 +234,7 @@ def _chain(robot, link):
 
 
 def _origin(joint):
-    xyz, rpy = (three_numbers((joint.origin and getattr(joint.origin, name)) or (0, 0, 0), f'origin {name} of joint {joint.name}')
+    xyz, rpy = (several_numbers((joint.origin and getattr(joint.origin, name)) or (0, 0, 0), f'origin {name} of joint {joint.name}')
                 for name in ('xyz', 'rpy'))
     return np.array(xyz), rotation_from_rpy(rpy)
 

@@ -15,7 +15,7 @@ from imu_calibration.preprocessing import value_checks
 from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING, CheckFinding, EvidenceGatherer, RecordingEvidence
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS, FrozenPart, in_long_runs
 from imu_calibration.preprocessing.stamping import IRREGULAR, MAX_IRREGULAR_SHARE
-from imu_calibration.preprocessing.stream_cleaning import MESSAGES, BlockCleaner, CleanedBlock, StreamStatistics
+from imu_calibration.preprocessing.stream_cleaning import MESSAGES, BlockCleaner, StreamStatistics
 
 MIN_MOVING_STEPS = 50.0
 """A constant axis is frozen if another axis moves by this many steps of the converter."""
@@ -188,7 +188,7 @@ CHECKS = (
 """In the order in which they refuse: a wrong unit causes failures of later checks as well."""
 
 
-class Preflight:
+class Preflight(EvidenceGatherer):
     """
     Watches a recording while it is read (a `Watcher`).
 
@@ -202,15 +202,12 @@ class Preflight:
     """
 
     def __init__(self, gravity: float | None = None, *, strict: bool = True):
-        self._gatherer, self._strict = EvidenceGatherer(STANDARD_GRAVITY if gravity is None else gravity), strict
+        super().__init__(STANDARD_GRAVITY if gravity is None else gravity)
+        self._strict = strict
         self.findings: tuple[CheckFinding, ...] = ()
         self.streams: dict[str, StreamStatistics] = {}
         self.lost: dict[str, int] = {}
         """Findings; name -> StreamStatistics; reason -> number of unreadable messages: complete after `finish`."""
-
-    def push(self, cleaned: CleanedBlock) -> None:
-        """Process a CleanedBlock."""
-        self._gatherer.push(cleaned)
 
     def finish(self, cleaner: BlockCleaner) -> None:
         """
@@ -223,7 +220,7 @@ class Preflight:
 
         """
         self.streams, self.lost = cleaner.statistics(), cleaner.lost
-        evidence = self._gatherer.evidence(self.streams)
+        evidence = self.evidence(self.streams)
         self.findings = tuple(finding for check in CHECKS for finding in check(evidence)) if 'imu' in evidence.streams else ()
         if self._strict:
             refuse(self.findings)

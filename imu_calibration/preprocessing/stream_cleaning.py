@@ -374,7 +374,9 @@ class BlockCleaner:
         for name in STREAMS:
             samples = getattr(block, name)
             if samples is not None and len(samples):
-                self._raw[name].append(self._in_our_terms(name, samples))
+                if name == 'imu' and self._nominal is not None:
+                    samples = self._nominal.apply(samples)
+                self._raw[name].append(self._in_order(samples) if name == 'joints' else samples)
         if self.n_buffered < CLEANING_BATCH:
             return CleanedBlock()
         self._clean()
@@ -408,11 +410,6 @@ class BlockCleaner:
         for watcher in self._watchers:
             watcher.push(cleaned)
         return cleaned
-
-    def _in_our_terms(self, name, samples):
-        if name == 'joints':
-            return self._in_order(samples)
-        return samples if name != 'imu' or self._nominal is None else self._nominal.apply(samples)
 
     def _in_order(self, joints):
         if not self._names or not joints.names or tuple(joints.names) == self._names:
