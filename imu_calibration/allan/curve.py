@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 from typing import Protocol
 
 import numpy as np
@@ -84,10 +86,7 @@ class AllanSums:
         self._length += len(values)
         rows = np.ascontiguousarray((values - self._offset).T)
         rows[:, ~present] = 0.0
-        self._take(rows, None if present.all() else present.astype(float))
-
-    def _take(self, rows, counts):
-        """Hand samples to the first level and halve the rate from level to level; `counts` None: none is missing."""
+        counts = present.astype(float)
         for k, level in enumerate(self._levels):
             if k:
                 rows, counts = level.halved(rows, counts)
@@ -126,36 +125,27 @@ class _Level:
 
     def forget(self):
         """Begin anew."""
-        self.sums = np.zeros((self.n_columns, 1))
-        self.counts = None
-        self.odd = None
+        self.sums, self.counts = np.zeros((self.n_columns, 1)), np.zeros(1)
+        self.odd = np.zeros((self.n_columns, 0)), np.zeros(0)
 
     def halved(self, rows, counts):
-        """Return sums of pairs of samples and how many samples are in each; a sample without a mate waits."""
-        counts = np.ones(rows.shape[1]) if counts is None and self.odd is not None and self.odd[1] is not None else counts
-        if self.odd is not None:
-            rows = np.concatenate([self.odd[0], rows], axis=1)
-            if counts is not None:
-                before = np.ones(1) if self.odd[1] is None else self.odd[1]
-                counts = np.concatenate([before, counts])
-        n = rows.shape[1] // 2 * 2
-        self.odd = (rows[:, n:], None if counts is None else counts[n:]) if n < rows.shape[1] else None
-        pairs = rows[:, 0:n:2] + rows[:, 1:n:2]
-        return pairs, None if counts is None else 0.5 * (counts[0:n:2] + counts[1:n:2])
+        """Return sums of pairs of samples and the share of each that is present; a sample without a mate waits."""
+        rows, counts = (np.concatenate(pair, axis=-1) for pair in zip(self.odd, (rows, counts)))
+        n = len(counts) // 2 * 2
+        self.odd = rows[:, n:], counts[n:]
+        return rows[:, 0:n:2] + rows[:, 1:n:2], 0.5 * (counts[0:n:2] + counts[1:n:2])
 
     def push(self, rows, counts, size, squares, terms):
         """Add the second differences that end in the new samples, each the sum of `size` original ones."""
         old = self.sums.shape[1]
         self.sums = np.concatenate([self.sums, self.sums[:, -1:] + np.cumsum(rows, axis=1)], axis=1)
-        if counts is not None or self.counts is not None:
-            before = np.arange(float(old)) if self.counts is None else self.counts
-            new = np.ones(rows.shape[1]) if counts is None else counts
-            self.counts = np.concatenate([before, before[-1] + np.cumsum(new)])
+        self.counts = np.concatenate([self.counts, self.counts[-1] + np.cumsum(counts)])
+        whole = self.counts[-1] - self.counts[0] == len(self.counts) - 1
         for where, m in zip(self.index, self.factors):
             first = max(old, 2 * m)
             if first >= self.sums.shape[1]:
                 continue
-            if self.counts is None:
+            if whole:
                 last, middle, begin = (self.sums[:, first - k:self.sums.shape[1] - k] for k in (0, m, 2 * m))
                 difference = last - 2.0 * middle
                 difference += begin
@@ -175,15 +165,10 @@ class _Level:
         return m * (means[0] - means[1])
 
     def _shorten(self):
-        """Keep what later differences need, counted from the first sample kept; drop earlier holes."""
-        if self.sums.shape[1] <= self.reach + 1:
-            return
-        self.sums = self.sums[:, -self.reach - 1:]
-        self.sums = self.sums - self.sums[:, :1]
-        if self.counts is not None:
-            self.counts = self.counts[-self.reach - 1:] - self.counts[-self.reach - 1]
-            if self.counts[-1] == self.reach:
-                self.counts = None
+        """Keep the sums that later differences need, from the first sample kept."""
+        if self.sums.shape[1] > self.reach + 1:
+            kept = slice(-self.reach - 1, None)
+            self.sums, self.counts = self.sums[:, kept] - self.sums[:, kept][:, :1], self.counts[kept] - self.counts[kept][0]
 
 
 MAX_STEP_JITTER = 0.2
@@ -206,10 +191,6 @@ class SampleGrid:
     def __init__(self, period: float):
         self._period_ns = period * 1e9
         self._last_ns: int | None = None
-
-    def begin(self) -> None:
-        """Begin a new stretch."""
-        self._last_ns = None
 
     def steps(self, stamp_ns: np.ndarray) -> np.ndarray:
         """Return for each sample the number of periods since the one before, at least 1, shape (n,); the first of a stretch counts 1."""
@@ -322,11 +303,27 @@ class RestReader:
 
     def read(self, *bare: Sink, raw: Sink | None = None) -> None:
         """Push the samples of each part without trends into the sinks `bare`, and unchanged into `raw`."""
-        reader = _PartReader(bare, raw, self.period, self.detrending)
+        for (epoch, _), pieces in groupby(self._pieces(), key=itemgetter(0, 1)):
+            grid = SampleGrid(self.period)
+            for *_, imu in pieces:
+                values = np.concatenate([imu.force_s, imu.rate_s], axis=1)
+                steps, trend = grid.steps(imu.stamp_ns), self.detrending.at(self.time_of(epoch, imu.stamp_ns))
+                flat = spread(values if trend is None else values - trend, steps)
+                for sink in bare:
+                    sink.push(*flat)
+                if raw is not None:
+                    raw.push(*spread(values, steps))
+            for sink in filter(None, (*bare, raw)):
+                sink.end_stretch()
+
+    def _pieces(self):
+        """Yield (epoch, number of the part, accepted samples)."""
+        bounds = [np.array([(part.first_ns, part.end_ns) for part in parts], np.int64).reshape(-1, 2) for parts in self.parts]
         for cleaned in BlockCleaner(nominal=self.nominal).all_of(self.source()):
             for epoch, imu in cleaned.imu:
-                reader.push(epoch, imu, self.parts[epoch], self.time_of)
-        reader.close()
+                for number, (first, last) in enumerate(np.searchsorted(imu.stamp_ns, bounds[epoch]).tolist()):
+                    if last > first:
+                        yield epoch, number, imu.select(slice(first, last))
 
     def curve(self) -> AllanCurve:
         """Return the Allan variances of the parts."""
@@ -338,42 +335,3 @@ class RestReader:
         parts = tuple(Parts(variance[:, :, axis], terms) for axis in range(variance.shape[2]))
         return AllanCurve(self.period, bare.factors[usable], bare.variance()[usable], (raw or bare).variance()[usable],
                           tuple(bare.lengths), parts)
-
-
-class _PartReader:
-    """Splits accepted samples into parts and pushes them into the sinks."""
-
-    def __init__(self, bare, raw, period, detrending):
-        self._bare, self._raw, self._detrending = bare, raw, detrending
-        self._grid, self._open = SampleGrid(period), None
-
-    def push(self, epoch, imu, parts, time_of):
-        """Add accepted samples of an epoch."""
-        if not len(imu):
-            return
-        begin, end = int(imu.stamp_ns[0]), int(imu.stamp_ns[-1])
-        for k, part in enumerate(parts):
-            if part.end_ns <= begin or part.first_ns > end:
-                continue
-            if self._open != (epoch, k):
-                self.close()
-                self._open = (epoch, k)
-            first, last = np.searchsorted(imu.stamp_ns, (part.first_ns, part.end_ns))
-            if last > first:
-                self._take(imu.select(slice(first, last)), lambda stamps: time_of(epoch, stamps))
-
-    def _take(self, imu, time_of):
-        values = np.concatenate([imu.force_s, imu.rate_s], axis=1)
-        steps = self._grid.steps(imu.stamp_ns)
-        trend = self._detrending.at(time_of(imu.stamp_ns))
-        grid, present = spread(values if trend is None else values - trend, steps)
-        for sink in self._bare:
-            sink.push(grid, present)
-        if self._raw is not None:
-            self._raw.push(*spread(values, steps))
-
-    def close(self):
-        """Close the open part."""
-        self._grid.begin()
-        for sink in filter(None, (*self._bare, self._raw)):
-            sink.end_stretch()

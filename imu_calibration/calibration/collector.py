@@ -15,9 +15,8 @@ from imu_calibration.calibration.from_solution import ModelChanges, ModelExtensi
 from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.samples import NominalScaling, SampleBlock
-from imu_calibration.effects.base import SECTIONS, SENSORS
+from imu_calibration.effects.base import SECTIONS
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.effects.forward_equations import columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, WindowBlock
 from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics, reduce_window
@@ -178,11 +177,13 @@ class Collector:
     def _take(self, windows):
         if self.windows is not None:
             self.windows.extend(windows)
-        return [self._reduce(window) for window in windows if window.kind != 'unused']
+        used = [window for window in windows if window.kind != 'unused']
+        for window in used:
+            self._add(window)
+        return used
 
-    def _reduce(self, window):
-        reduced = reduce_window(window, self.model, self.table, session=self.session, with_pieces=True,
-                                column_function=self._columns(window))
+    def _add(self, window):
+        reduced = reduce_window(window, self.model, self.table, session=self.session, with_pieces=True)
         found = self.gathered
         found.take(reduced)
         found.largest_force = max(found.largest_force, float(np.max(np.abs(window.force_s))))
@@ -192,11 +193,6 @@ class Collector:
         else:
             found.largest_rate = max(found.largest_rate, float(np.sqrt((window.rate_s**2).sum(axis=1).max())))
         self._store(window, reduced)
-        return reduced
-
-    def _columns(self, _window):
-        """Return the function that gives the columns of a window."""
-        return columns
 
     def _store(self, window, _reduced: WindowStatistics):
         kept = self.gathered.kept
@@ -252,32 +248,13 @@ class GatherStep:
         return gathered
 
 
-def columns_at(window: Window, model: SensorModel, *, table: Table, reported: slice) -> dict[str, np.ndarray]:
-    """Return sensor -> columns at the samples `reported` of a window."""
-    motion, temperature = joined_motion([window])
-    if window.kind != 'static':
-        motion, temperature = motion.select(reported), None if temperature is None else temperature[reported]
-    return {sensor: columns(model, sensor, table, motion=motion, temperature_c=temperature) for sensor in SENSORS}
-
-
 class LiveCollector(Collector):
-    """A Collector that hands completed windows on, with their columns at the samples `reported`, and keeps a bounded number of them."""
+    """A Collector that keeps a bounded number of windows."""
 
-    def __init__(self, table: Table, model: SensorModel, options: CalibrationOptions, *, session: int, store: WindowStore,
-                 reported: Callable[[Window], slice]):
+    def __init__(self, table: Table, model: SensorModel, options: CalibrationOptions, *, session: int, store: WindowStore):
         super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
-        self.store, self._reported, self._completed = store, reported, {}
+        self.store = store
         self.gathered.spreads = [DecimatedWindows(MAX_LIVE_SAMPLES)]
-
-    def _columns(self, window):
-        reported, designs = self._reported(window), {}
-
-        def kept(model, sensor, *arguments, **options):
-            found = columns(model, sensor, *arguments, **options)
-            designs[sensor] = found if window.kind == 'static' else found[reported].copy()
-            return found
-        self._completed[window] = reported, designs
-        return kept
 
     def _store(self, window, reduced):
         kept = owned_window(window)
@@ -288,15 +265,10 @@ class LiveCollector(Collector):
         """Gather the columns of another model from now on; those of all kept windows are computed again."""
         self.model, self.gathered = model, self.gathered.anew(self.store.reduced(model, self.table, self.session))
 
-    def take_completed(self) -> dict[Window, tuple[slice, dict[str, np.ndarray]]]:
-        """Return the windows since the last call, each with the samples for published residuals and their columns."""
-        completed, self._completed = self._completed, {}
-        return completed
-
     def snapshot(self, pending: bool) -> tuple[SessionData, WindowStore]:
         """Return copies of the gathered data and of the store; with `pending`, open windows are closed in the copies."""
         twin = copy.copy(self)
-        twin.gathered, twin.store, twin._completed = copied(self.gathered), self.store.copy(), {}
+        twin.gathered, twin.store = copied(self.gathered), self.store.copy()
         if pending:
             twin.gatherer = copy.deepcopy(self.gatherer)
             twin.finish()

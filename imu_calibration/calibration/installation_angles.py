@@ -91,9 +91,9 @@ def _angle_sd(axis, j, spread):
     size = np.linalg.norm(across)
     if size**2 <= np.trace(tilt):
         return float(np.sqrt(np.trace(tilt) / 2))
-    if size < abs(axis[j]):
-        return float(np.sqrt(across @ tilt @ across) / size / abs(axis[j]))
-    return float(np.sqrt(spread[j, j]) / size)
+    slope = axis[j] * axis / size
+    slope[j] = -size
+    return float(np.sqrt(slope @ spread @ slope))
 
 
 def _between_sd(axes, tangent, covariance, i, j):

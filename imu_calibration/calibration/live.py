@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.calibration.collector import LiveCollector, columns_at, copied, from_bytes, require_columns, to_bytes
+from imu_calibration.calibration.collector import LiveCollector, copied, from_bytes, require_columns, to_bytes
 from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, GroupState, group_states, table_coverage, waiting_groups
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, LiveSnapshot
@@ -15,9 +15,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import selected_columns
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.stamping import StampLine
 from imu_calibration.preprocessing.window import Window, WindowSettings
@@ -69,7 +67,6 @@ class LiveCalibration:
         """The data of the last solution."""
         self.needs_linearising = False
         """Whether the last solution is outside the validity of its linearisation, and the store is too small to linearise again."""
-        self._designs: dict[Window, tuple[slice, dict[str, np.ndarray]]] = {}
         asked = self._asked
         if known is not None:
             if asked.needs_temperature:
@@ -145,13 +142,7 @@ class LiveCalibration:
             self._first_temperature_c = float(block.temperature.temperature_c[0])
         if self._collector is None:
             return self._push_before_temperature(block)
-        self._collector.push(block)
-        return self._completed()
-
-    def _completed(self):
-        """Return the windows since the last call; their columns are kept until the next call."""
-        self._designs = self._collector.take_completed()
-        return list(self._designs)
+        return self._collector.push(block)
 
     def _push_before_temperature(self, block):
         self._waiting.append(block)
@@ -160,16 +151,14 @@ class LiveCalibration:
             return []
         self._begin(self._asked.with_reference_temperature(self._first_temperature_c))
         blocks, self._waiting = self._waiting, []
-        for held_back in blocks:
-            self._collector.push(held_back)
-        return self._completed()
+        return [window for held_back in blocks for window in self._collector.push(held_back)]
 
     def _begin(self, model):
         session = 0
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
         store = WindowStore(self.settings.store_samples, self.earlier is None)
-        self._collector = LiveCollector(self.table, model, self.options, session=session, store=store, reported=self._reported)
+        self._collector = LiveCollector(self.table, model, self.options, session=session, store=store)
 
     def solve(self, pending: bool = False, provenance: dict | None = None) -> TableResult:
         """
@@ -216,7 +205,6 @@ class LiveCalibration:
             if not collector.store.complete:
                 return False
             collector.take_model(model)
-            self._designs = {}
         self.extension = extension
         return True
 
@@ -249,24 +237,13 @@ class LiveCalibration:
         """
         if self.result is None or not windows or not self.settings.residual_rate:
             return None
-        parts = [self._residual(window) for window in windows]
-        return ImuSamples.concatenate(parts)
-
-    def _reported(self, window):
-        """Return the samples of a window with published residuals."""
-        every = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
-        return slice(every // 2 if len(window) > every // 2 else 0, None, every)
+        return ImuSamples.concatenate([self._residual(window) for window in windows])
 
     def _residual(self, window):
-        model, values, gathered_with = self.result.model, self.result.solution.values, self._collector.model
-        reported, designs = self._designs.get(window, (None, None))
-        if designs is None or self.result.gathered_model is not gathered_with:   # the solution was linearised elsewhere
-            reported, gathered_with = self._reported(window), model
-            designs = columns_at(window, model, table=self.table, reported=reported)
-        chosen = selected_columns(gathered_with, model)
-        parts = [measured[reported] - designs[sensor][:, chosen[sensor][:-3]] @ coefficients(model, sensor, values)
-                 for sensor, measured in zip(SENSORS, (window.force_s, window.rate_s))]
-        return ImuSamples(window.stamp_ns[reported], *parts, self._collector.gathered.frame_id)
+        every = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
+        some = slice(every // 2 if len(window) > every // 2 else 0, None, every)
+        residuals = self.result.residuals_of(window)
+        return ImuSamples(window.stamp_ns[some], *(residuals[sensor][some] for sensor in SENSORS), self._collector.gathered.frame_id)
 
     def coverage(self) -> Coverage:
         """Return the Coverage: which attitudes are worth having, which motion helps most."""

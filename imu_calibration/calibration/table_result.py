@@ -9,7 +9,7 @@ are common when the table is not level and independent when an encoder is read i
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -32,8 +32,9 @@ from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.weighted_system import fixed_parameters, make_prior
 from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.estimation.window_statistics import joined_motion
 from imu_calibration.kinematics.chain import tilt
-from imu_calibration.kinematics.joint_motion import rest_at
+from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBlock
@@ -111,96 +112,69 @@ def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.n
 
     Summed over windows: the shift of the estimate when all windows err together. A shift is estimate minus truth.
     """
-    solution = result.solution
-    slopes = {sensor: coefficient_jacobian(solution.model, sensor, solution.values) for sensor in SENSORS}
-    pieces = [_piece(result, changes, slopes, *source) for source in _sources(result)]
-    free = ~fixed_parameters(solution.model) & ~solution.held
+    solution, sources = result.solution, list(_sources(result))
+    outputs = [_outputs(result, source, changes) for source in sources]
     prior = make_prior(solution.model)
     normal = prior.root.T @ prior.root
-    right = np.zeros((len(changes), len(pieces), len(solution.values)))
+    right = np.zeros((len(changes), len(sources), len(solution.values)))
+    counts, times = (np.array([getattr(source, name) for source in sources]) for name in ('samples', 'time'))
     for sensor in SENSORS:
-        design = np.array([piece.mean[sensor] for piece in pieces])
-        whitening = _whitening(solution.noise[sensor], pieces)
-        weighted = whitening.adjoint(whitening(design))
-        for axis in range(3):
-            normal = normal + weighted[:, axis].T @ design[:, axis]
-            for k, piece in enumerate(pieces):
-                normal += piece.within[sensor][axis]
-                right[:, k] += np.outer(piece.change[sensor][:, axis], weighted[k, axis]) + piece.within_change[sensor][:, axis]
-    index = np.flatnonzero(free)
+        slope, noise = coefficient_jacobian(solution.model, sensor, solution.values), solution.noise[sensor]
+        designs = [np.einsum('nq,qap->nap', own[sensor][0], slope) for own in outputs]
+        means = np.array([design.mean(axis=0) for design in designs])
+        variance = noise.mean_variance([source.kind for source in sources], counts) + noise.offset_sd**2
+        whitening = Whitening(variance, times, sessions_of(sources), processes=noise.bias_processes)
+        weighted = whitening.adjoint(whitening(means))
+        normal = normal + np.tensordot(weighted, means, ([0, 1], [0, 1]))
+        for k, (source, design, own) in enumerate(zip(sources, designs, outputs)):
+            centred, moved = design - means[k], own[sensor][1]
+            within = centred / (noise.row_variance(source.kind) / source.stride)[:, None]
+            normal += np.tensordot(within, centred, ([0, 1], [0, 1]))
+            right[:, k] += moved.mean(axis=1) @ weighted[k] + np.tensordot(moved, within, ([1, 2], [0, 1]))
+    index = np.flatnonzero(~fixed_parameters(solution.model) & ~solution.held)
     shifts = np.zeros_like(right)
     shifts[:, :, index] = right[:, :, index] @ inverse_normal(normal[np.ix_(index, index)])
     return shifts
 
 
-def _whitening(noise, pieces):
-    """Return the `Whitening` of the means of the windows."""
-    variance = noise.mean_variance([p.kind for p in pieces], np.array([p.count for p in pieces])) + noise.offset_sd**2
-    return Whitening(variance, np.array([p.time for p in pieces]), sessions_of(pieces), processes=noise.bias_processes)
-
-
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """One window: design and changes of the output, mean and centred, weighted where centred."""
+class _Source(NamedTuple):
+    """A window at rest, or a moving one that was kept; its samples are `stride` apart."""
 
     kind: str
-    """'static', 'spin' or 'dynamic'."""
     time: float
-    """Middle, s."""
     session: int
-    """Recording."""
-    count: float
-    """Samples."""
-    mean: dict
-    """Sensor -> mean design of each axis, shape (3, n_params)."""
-    within: dict
-    """Sensor -> products of the centred design, shape (3, n_params, n_params)."""
-    change: dict
-    """Sensor -> mean change of the output, shape (n_changes, 3)."""
-    within_change: dict
-    """Sensor -> centred design times centred change, shape (n_changes, 3, n_params)."""
+    samples: float
+    stride: int
+    motion: JointMotion
+    temperature_c: np.ndarray | None
 
 
 def _sources(result):
-    """Yield (kind, time, session, count, stride, motion, temperature) of the windows at rest and of the moving ones that were kept."""
+    """Yield the windows at rest, and the moving ones that were kept."""
     rows = {(row.session, row.time): row.count for row in result.gathered.accumulator.rows if row.kind == 'static'}
     typical = float(np.median(list(rows.values()))) if rows else 1.0
     for time, session, position in result.gathered.poses:
         motion = replace(rest_at(np.asarray(position)[None]), time=np.array([time]))
-        yield 'static', time, session, rows.get((session, time), typical), 1, motion, None
+        yield _Source('static', time, session, rows.get((session, time), typical), 1, motion, None)
     stride = max(1, int(np.ceil(sum(len(w) for w in result.gathered.kept) / MOVING_SAMPLES)))
-    for number, window in enumerate(result.gathered.kept):
+    for window in result.gathered.kept:
         some = slice(None, None, stride)
         temperature = None if window.temperature_c is None else window.temperature_c[some]
-        yield window.kind, float(window.time.mean()), 0, len(window), stride, window.motion.select(some), temperature
+        yield _Source(window.kind, float(window.time.mean()), 0, len(window), stride, window.motion.select(some), temperature)
 
 
-def _piece(result, changes, slopes, kind, time, session, count, stride, motion, temperature):
-    model, values, table = result.solution.model, result.solution.values, result.table
-    temperature = _known(model, motion, temperature)
-    parts = {name: {} for name in ('mean', 'within', 'change', 'within_change')}
-    references = References(model, table, motion, temperature_c=temperature)
-    changed = [References(model, *change(table, motion), temperature_c=temperature) for change in changes]
+def _outputs(result, source, changes):
+    """Return sensor -> (columns, changes of the output, shape (n_changes, n, 3)) at the samples of a window."""
+    model, temperature, known = result.solution.model, source.temperature_c, (result.table, source.motion)
+    if model.needs_temperature and temperature is None:   # the mean at rest is not kept
+        temperature = np.full(len(source.motion), model.temperature_ref_c)
+    references = [References(model, *pair, temperature_c=temperature) for pair in (known, *(change(*known) for change in changes))]
+    found = {}
     for sensor in SENSORS:
-        design, slope = columns(model, sensor, table, motion=motion, temperature_c=temperature, references=references), slopes[sensor]
-        output = sensor_output(model, sensor, values, ref=references.at(sensor))
-        moved = [sensor_output(model, sensor, values, ref=each.at(sensor)) - output for each in changed]
-        moved = np.array(moved).reshape(-1, len(motion), 3)
-        mean = design.mean(axis=0)
-        parts['mean'][sensor] = np.einsum('q,qap->ap', mean, slope)
-        parts['change'][sensor] = moved.mean(axis=1)
-        variance = result.solution.noise[sensor].row_variance(kind) / stride
-        centred = design - mean
-        rest = moved - moved.mean(axis=1, keepdims=True)
-        gram, cross = centred.T @ centred, np.einsum('nq,kna->kaq', centred, rest)
-        parts['within'][sensor] = np.stack([slope[:, a].T @ gram @ slope[:, a] / variance[a] for a in range(3)])
-        parts['within_change'][sensor] = np.stack([cross[:, a] @ slope[:, a] / variance[a] for a in range(3)], axis=1)
-    return _Piece(kind, time, session, count, **parts)
-
-
-def _known(model, motion, temperature):
-    """Return temperatures if the model needs them; the mean at rest is not kept, so that the reference temperature is used there."""
-    return np.full(len(motion), model.temperature_ref_c) if model.needs_temperature and temperature is None else temperature
+        output, *moved = (sensor_output(model, sensor, result.solution.values, ref=each.at(sensor)) for each in references)
+        found[sensor] = columns(model, sensor, result.table, motion=source.motion, temperature_c=temperature, references=references[0]), \
+            np.array(moved).reshape(-1, *output.shape) - output
+    return found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -246,7 +220,8 @@ class TableResult(CalibrationResult):
 
     def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
         """Return measured values minus those predicted from the motion of the table."""
-        predicted = predict(self.solution.model, self.solution.values, self.table, motion=window.motion, temperature_c=window.temperature_c)
+        motion, temperature_c = joined_motion([window])
+        predicted = predict(self.solution.model, self.solution.values, self.table, motion=motion, temperature_c=temperature_c)
         return {sensor: measured - model for sensor, measured,
                 model in zip(SENSORS, (window.force_s, window.rate_s), predicted, strict=True)}
 

@@ -167,10 +167,9 @@ def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, 
     return [_reduced(window, {s: designs[s][a:b] for s in SENSORS}, session, inputs) for window, a, b in zip(windows, edges, edges[1:])]
 
 
-def reduce_window(window: Window, model: SensorModel, table: Table, *, session: int = 0, column_function: Callable = columns,
-                  with_pieces: bool = False) -> WindowStatistics:
+def reduce_window(window: Window, model: SensorModel, table: Table, *, session: int = 0, with_pieces: bool = False) -> WindowStatistics:
     """Reduce one window to its statistics; arguments as in `reduce_windows`."""
-    return reduce_windows([window], model, table, session=session, column_function=column_function, with_pieces=with_pieces)[0]
+    return reduce_windows([window], model, table, session=session, with_pieces=with_pieces)[0]
 
 
 def _reduced(window, designs, session, inputs):

@@ -12,7 +12,7 @@ from imu_calibration.estimation import noise_model
 from imu_calibration.estimation.accumulator import Accumulator, restrict
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.weighted_system import make_prior
-from imu_calibration.estimation.window_statistics import reduce_window
+from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_finder import MotionGatherer
@@ -55,7 +55,7 @@ def accumulate(windows, model, column_function=columns):
     """Return the least-squares system of windows."""
     accumulator = Accumulator()
     for window in windows:
-        accumulator.add(reduce_window(window, model, TABLE, column_function=column_function))
+        accumulator.add(reduce_windows([window], model, TABLE, column_function=column_function)[0])
     return accumulator
 
 

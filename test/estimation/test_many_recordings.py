@@ -12,7 +12,7 @@ from imu_calibration.effects.forward_equations import coefficients, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solver import solve
-from imu_calibration.estimation.window_statistics import reduce_window
+from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_finder import MotionGatherer
@@ -53,8 +53,9 @@ def recordings(motion, values, steps, rng):
         for window, designs in motion:
             outputs = [designs[s] @ coefficients(MODEL, s, values) + step[s] + rng.normal(0, SDS[s],
                                                                                           (len(window.time), 3)) for s in SENSORS]
-            part.add(reduce_window(Window(**{**vars(window), 'force_s': outputs[0], 'rate_s': outputs[1]}), MODEL, TABLE, session=session,
-                                   column_function=lambda model, sensor, table, known=designs, **motion: known[sensor]))
+            measured = Window(**{**vars(window), 'force_s': outputs[0], 'rate_s': outputs[1]})
+            part.add(*reduce_windows([measured], MODEL, TABLE, session=session,
+                                     column_function=lambda model, sensor, table, known=designs, **motion: known[sensor]))
         total.merge(part)
     return total
 

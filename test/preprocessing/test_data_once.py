@@ -3,17 +3,14 @@
 from collections import Counter
 from pathlib import Path
 
-import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration import collector
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
-from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.core.errors import ImuCalibrationError
-from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files, verdict
 from imu_calibration.estimation import observability
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
@@ -99,19 +96,3 @@ def test_verdict_and_needed_motions_are_worked_out_once_per_solution(table, monk
     result = calibrate([source_of(BAG, Topics(), table.joint_names)], table, CalibrationOptions(reference_model='table_tilt'))
     assert result.verdict.lines() and result.needed is not None
     assert len(judged) == len(needed) == 1
-
-
-def test_columns_of_a_window_are_computed_once_for_its_statistics_and_its_residuals(table, monkeypatch):
-    (block,) = list(source_of(BAG, Topics(), table.joint_names)())
-    half = block.imu.stamp_ns[len(block.imu) // 2]
-    first, second = (SampleBlock(*(s.select((s.stamp_ns < half) == early) for s in (block.imu, block.joints))) for early in (True, False))
-    live = LiveCalibration(table, PLAIN)
-    live.push(first)
-    live.solve()
-    calls = counting(monkeypatch, collector, 'columns')
-    windows = live.push(second)
-    told = live.residuals(windows)
-    assert len(told) > len(windows) > 10 and len(calls) == 2 * len(windows)
-    live._designs = {}
-    np.testing.assert_allclose(live.residuals(windows).force_s, told.force_s, atol=1e-12)
-    assert len(calls) == 4 * len(windows), 'without the columns at hand they are computed again'
