@@ -24,7 +24,7 @@ from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.stream_cleaning import Watcher
-from imu_calibration.preprocessing.window import StoredWindows, Window, WindowSettings, joined_motion
+from imu_calibration.preprocessing.window import StoredWindows, Window, WindowSettings
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import (

@@ -32,11 +32,10 @@ from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.weighted_system import fixed_parameters, make_prior
 from imu_calibration.estimation.whitening import Whitening
-from imu_calibration.estimation.window_statistics import joined_motion
 from imu_calibration.kinematics.chain import tilt
 from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window
+from imu_calibration.preprocessing.window import Window, joined_motion
 from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBlock
 
 LEVELLING_SD = 2 * ARCMIN
