@@ -18,24 +18,18 @@ if TYPE_CHECKING:
 def show_table(out: Terminal, headings: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Collection[str] = (),
                dimmed: bool = False) -> None:
     """
-    Print a table, `numbers` flush right; a column that is too wide for the terminal is at least as wide as its longest word.
+    Print a table, `numbers` flush right.
 
     `dimmed`: rows with an empty last cell are dim.
     """
     rows = [tuple(row) for row in rows]
-    most = [max(map(len, column)) for column in zip(headings, *rows, strict=True)]
-    narrow = sum(most) + 2 * (len(most) - 1) > out.width
+    narrow = sum(2 + max(map(len, column)) for column in zip(headings, *rows, strict=True)) - 2 > out.width
     if narrow:   # dotted names may break at a dot
         rows = [(row[0].replace('.', ' '), *row[1:]) for row in rows]
-    least = [max(len(word) for cell in column for word in [*cell.split(), '']) for column in zip(headings, *rows, strict=True)]
-    widths, room = list(least), out.width - sum(least) - (len(least) - 1)
-    for k in sorted(range(len(widths)), key=lambda k: headings[k] not in numbers):   # numbers first
-        widths[k] += max(0, min(room, most[k] - least[k]))
-        room -= widths[k] - least[k]
     styles = ['bold', *('dim' if dimmed and not row[-1] else '' for row in rows)]
     cells = [[(cell, style) for cell in row] for row, style in zip([headings, *rows], styles, strict=True)]
     right = [k for k, heading in enumerate(headings) if heading in numbers]
-    out.write(out.table(cells, widths=widths if narrow else (), right=right, gap=1 if narrow else 2))
+    out.write(out.table(cells, right=right, gap=1 if narrow else 2))
 
 
 def warn(found: Sequence[dict[str, Any]] | Iterator) -> None:

@@ -61,17 +61,15 @@ class Terminal:
         self.stream.flush()
         return len(lines)
 
-    def table(self, rows: Sequence[Sequence[Cell]], *, widths: Sequence[int] = (), right: Sequence[int] = (), gap: int = 2) -> list[str]:
+    def table(self, rows: Sequence[Sequence[Cell]], *, right: Sequence[int] = (), gap: int = 2) -> list[str]:
         """
-        Return the lines of a table without rules.
+        Return the lines of a table without rules; a column that is too wide is at least as wide as its longest word.
 
         Parameters
         ----------
         rows : sequence of sequences of Cell
-        widths : sequence of int, optional
-            Characters of each column; the default is its longest cell, and for the last column the remaining width at most.
         right : sequence of int
-            Columns that are flush right.
+            Columns that are flush right; they get their width first.
         gap : int
             Spaces between columns.
 
@@ -79,10 +77,12 @@ class Terminal:
         if not rows:
             return []
         cells = [[cell if isinstance(cell, tuple) else (cell, '') for cell in row] for row in rows]
-        if not widths:
-            widths = [max(len(text) for text, _ in column) for column in zip(*cells, strict=True)]
-            room = max(self.width - sum(widths[:-1]) - gap * (len(widths) - 1), 1)
-            widths = [*widths[:-1], min(widths[-1], room)]
+        columns = [[text for text, _ in column] for column in zip(*cells, strict=True)]
+        widths = [max(len(word) for text in column for word in [*text.split(), '']) for column in columns]
+        room = self.width - sum(widths) - gap * (len(widths) - 1)
+        for k in sorted(range(len(widths)), key=lambda k: k not in right):
+            wider = max(0, min(room, max(map(len, columns[k])) - widths[k]))
+            widths[k], room = widths[k] + wider, room - wider
         lines = []
         for row in cells:
             for parts in zip_longest(*(wrapped(text, width) for (text, _), width in zip(row, widths, strict=True)), fillvalue=''):

@@ -179,15 +179,14 @@ def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, place
         without[model.slices[effect.key]] = effect.prior_values()
     seen = {sensor: sensor_output(model, sensor, without, ref=ref) for sensor in SENSORS}
     true = placement.truth(ref.force_s, ref.rate_s, ref.alpha_s)
-    if target.whole:
-        made = true   # it represents all effects of the full compensation
-    else:
+    made, lost = true, ()   # the whole document represents all effects of the full compensation
+    if not target.whole:
         assert ref.temperature_c is not None   # a trial motion has it
         force, rate = placement.readings(*seen.values())
         readings = Readings(force, rate, ref.alpha_s @ placement.mat_ts.T, ref.temperature_c)
         made = target.corrected(numbers, readings)
-    lost = () if target.whole else tuple(_lost(calibration, effect, target.holds, motion) for effect in effects.values()
-                                         if effect not in estimated and not _whole(calibration, effect, target.holds))
+        lost = tuple(_lost(calibration, effect, target.holds, motion) for effect in effects.values()
+                     if effect not in estimated and not _whole(calibration, effect, target.holds))
     return Loss(lost, estimated, {s: _rms(m - t) for s, m, t in zip(SENSORS, made, true)},
                 {s: _rms(read[s] - t) for s, t in zip(SENSORS, (ref.force_s, ref.rate_s))}, motion.text)
 
