@@ -6,7 +6,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import AlignedArrays, ImuSamples
-from imu_calibration.kinematics.rotations import skew
+from imu_calibration.kinematics.rotations import nearest_rotation, skew
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, calibrate_by_hand
 from imu_calibration.references.gravity.hand_options import HandOptions
@@ -196,21 +196,15 @@ def relative_rotation(a: PairedImu, b: PairedImu) -> RelativeRotation:
         free = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
         over_a, over_b = over_a.select(free), over_b.select(free)
         rate_a, rate_b, alpha = over_a.mean(a.rate), over_b.mean(b.rate), over_a.slope(a.rate)
-        mat_ab = _align(rate_a, rate_b)
+        mat_ab = nearest_rotation(rate_a.T @ rate_b)
         offset -= float(np.sum((rate_b @ mat_ab.T - rate_a) * alpha) / max(np.sum(alpha * alpha), 1e-300))
     at_rest = _directions_at_rest(a, b, offset)
     pairs, overlap = ((rate_a, rate_b), SAMPLES_LEAST) if at_rest is None else (at_rest, 1)
-    mat_ab = _align(*pairs)
+    mat_ab = nearest_rotation(pairs[0].T @ pairs[1])
     residual = pairs[0] - pairs[1] @ mat_ab.T
     cross = skew(pairs[0])
     information = np.einsum('nki,nkj->ij', cross, cross) + 1e-12 * np.eye(3)
     return RelativeRotation(mat_ab, overlap * np.mean(residual**2) * np.linalg.inv(information), offset)
-
-
-def _align(vectors_a, vectors_b):
-    """Return the rotation closest to ``vectors_a = mat_ab @ vectors_b`` (Kabsch)."""
-    left, _, right = np.linalg.svd(vectors_a.T @ vectors_b)
-    return left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
 
 
 def _directions_at_rest(a, b, offset):

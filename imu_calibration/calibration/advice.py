@@ -15,6 +15,7 @@ from imu_calibration.calibration.coverage import DIRECTIONS, excess, share_gaine
 from imu_calibration.calibration.hand_step import TURNED, HandStep, steps_from, turn_rows
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import LACKING
+from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.references.gravity.equations import SCATTER_SD, Poses
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -193,4 +194,4 @@ def knowledge_after(hand: HandCalibration) -> HandKnowledge:
 
 def ups_of(poses: Poses | None) -> np.ndarray:
     """Return the directions that were up, unit vectors, shape (k, 3)."""
-    return np.zeros((0, 3)) if poses is None else poses.force / np.linalg.norm(poses.force, axis=1, keepdims=True)
+    return np.zeros((0, 3)) if poses is None else unit_rows(poses.force)

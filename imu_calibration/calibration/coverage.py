@@ -15,6 +15,7 @@ from imu_calibration.estimation.observability import ALL_MOTIONS, DIRECTIONS, MO
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import DETERMINED, LACKING
 from imu_calibration.estimation.weighted_system import GAUGE_SD, make_prior
+from imu_calibration.kinematics.rotations import unit_rows
 
 
 class Progress(StrEnum):
@@ -176,7 +177,7 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     step = _next_on_table(result) if first is None else _step(first.text)
     errors = result.window_errors()
     force = errors.true['accelerometer'][np.asarray(errors.kind) == 'static']
-    return Coverage(worth, force / np.linalg.norm(force, axis=1, keepdims=True), None, step, seconds, False, _arms(result), frame_id)
+    return Coverage(worth, unit_rows(force), None, step, seconds, False, _arms(result), frame_id)
 
 
 def _foretold(information, left, added, motions):

@@ -12,6 +12,7 @@ from imu_calibration.document.trust import Uncorrected, judged_from_of, uncorrec
 from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular_of_band
 from imu_calibration.estimation.solution import HELD
+from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.kinematics.strapdown import total_rotation
 from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, TurnData, between_middles
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
@@ -141,7 +142,7 @@ def turn_errors(model: HandModel, values: np.ndarray, poses: Poses, *, turns: Se
     for part in (model.gyro_bias, model.gyro_matrix, model.extra_index('gyroscope')):
         mixed[part] = gyroscope[part]
     true = corrected_with(model, values, poses.force, temperature_c=poses.temperature_c).force
-    up = true / np.linalg.norm(true, axis=1, keepdims=True)
+    up = unit_rows(true)
     rates = [corrected_with(model, mixed, turn.force, rate=turn.rate, temperature_c=turn.temperature_c).rate for turn in turns]
     return np.array([turn_error(poses, turn, rate, up=up) for turn, rate in zip(turns, rates, strict=True)])
 

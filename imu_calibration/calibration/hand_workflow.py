@@ -27,6 +27,7 @@ from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS, UNITS, Role
 from imu_calibration.estimation.solution import with_weak_replaced
+from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
@@ -254,7 +255,7 @@ def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gra
     norms, rest = (entry_of(errors, UNITS[sensor]) | {'seconds': rested} for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate))))
     proof = {'accelerometer': norms | {'regimes': {'rest': norms}}, 'gyroscope': rest | {'regimes': {'rest': rest}}}
     if len(turns) >= TURNS_LEAST:
-        up = force / np.linalg.norm(force, axis=1, keepdims=True)
+        up = unit_rows(force)
         # the first corrected readings are NaN where they need an angular acceleration
         errors = (np.array([[turn_error(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up=up)]
                             for turn in turns])

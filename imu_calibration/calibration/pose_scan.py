@@ -15,6 +15,7 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.solution import COMMON_SCALE, LACKING, tolerances_of
+from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.gravity.equations import Poses
@@ -98,7 +99,7 @@ def unseen(found: PoseScan) -> list[str]:
     """Return the faces ('+x', ...) that have not been up, the one furthest from all attitudes first."""
     if found.poses is None:
         return list(FACE_DIRECTIONS)
-    up = found.poses.force / np.linalg.norm(found.poses.force, axis=1, keepdims=True)
+    up = unit_rows(found.poses.force)
     nearest = {name: float(np.arccos(np.clip(up @ face, -1, 1)).min()) for name, face in FACE_DIRECTIONS.items()}
     return sorted((name for name, angle in nearest.items() if angle > FACE_REACH), key=lambda name: -nearest[name])
 

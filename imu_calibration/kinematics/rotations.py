@@ -73,6 +73,17 @@ def skew(vector: Sequence[float] | np.ndarray) -> np.ndarray:
     return matrix
 
 
+def unit_rows(vectors: np.ndarray) -> np.ndarray:
+    """Return the directions of vectors, shape (n, 3); zero for a vector of length zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+
+
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """Return the rotation closest to a matrix; of ``vectors_a.T @ vectors_b`` that of ``vectors_a = mat_ab @ vectors_b`` (Kabsch)."""
+    left, _, right = np.linalg.svd(matrix)
+    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+
+
 def cross(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the cross products of vectors along the last axis but one, shapes (..., 3, n) and (3, n) or (3, 1)."""
     (x, y, z), a, b, c = right, left[..., 0, :], left[..., 1, :], left[..., 2, :]

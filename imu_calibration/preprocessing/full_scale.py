@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.kinematics.rotations import skew
+from imu_calibration.kinematics.rotations import skew, unit_rows
 from imu_calibration.preprocessing.scan import Chunks, Rest
 
 MIN_MISSED_ANGLE = 0.25
@@ -61,7 +61,7 @@ def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
     if rest is None or len(rest.ranges) <= LEAST_TURNS:
         return None
     centre = rest.sphere[0] if rest.sphere is not None else np.zeros(3)
-    up = (rest.force - centre) / np.linalg.norm(rest.force - centre, axis=1, keepdims=True)
+    up = unit_rows(rest.force - centre)
     whole = np.abs(chunks.duration / np.median(chunks.duration) - 1) < 0.5
     turns = []
     for first, ((_, start), (stop, _)) in enumerate(zip(rest.ranges, rest.ranges[1:])):
@@ -238,7 +238,6 @@ def _pairs(chunks):
     good = whole[1:] & whole[:-1] & (step > 0) & (step < 1.5 * np.median(step)) & (np.linalg.norm(change, axis=1) < LARGEST_TURN)
     if good.sum() < 20:
         return None
-    middle = direction[1:] + direction[:-1]
-    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-9)
+    middle = unit_rows(direction[1:] + direction[:-1])
     rate = 0.5 * (chunks.mean[1:, 3:] + chunks.mean[:-1, 3:])[good]
     return middle[good], change[good], step[good], rate - np.median(rate, axis=0)

@@ -10,7 +10,7 @@ from imu_calibration.core.samples import runs_of, smallest_step
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.chain import reference_motion
-from imu_calibration.kinematics.rotations import rpy_from_rotation
+from imu_calibration.kinematics.rotations import nearest_rotation, rpy_from_rotation
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import refuse, span_words
 from imu_calibration.preprocessing.on_table import TESTED_RATE, exchanged, find_exchange, match_axes, same_motion, signs_or_delay
@@ -246,8 +246,7 @@ def _cause(match, matrix, seen, table):
 
 def _mount_rpy_deg(matrix, table):
     """Return roll, pitch, yaw of the rotation nearest to the measured matrix, in the convention of `mount.rpy_deg`."""
-    left, _, right = np.linalg.svd(matrix)
-    return np.degrees(rpy_from_rotation((left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right @ table.mat_sl).T))
+    return np.degrees(rpy_from_rotation((nearest_rotation(matrix) @ table.mat_sl).T))
 
 
 def check_units(gathered: Reduced, model: SensorModel, table: Table | None = None) -> None:

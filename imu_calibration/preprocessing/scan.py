@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.core.samples import AlignedArrays, runs_of
+from imu_calibration.kinematics.rotations import unit_rows
 
 CHUNK_SECONDS = 0.25
 """s; short against turns by hand, long against the period of the samples; also the distance at which temperatures are kept."""
@@ -162,8 +163,7 @@ class Rest:
         design = np.column_stack([2 * scaled, np.ones(len(scaled))])
         *centre, rest = np.linalg.lstsq(design, (scaled**2).sum(axis=1), rcond=None)[0]
         centre = np.array(centre)
-        directions = (scaled - centre) / np.maximum(np.linalg.norm(scaled - centre, axis=1, keepdims=True), 1e-9)
-        spread = np.linalg.eigvalsh(np.cov(directions.T))[0]
+        spread = np.linalg.eigvalsh(np.cov(unit_rows(scaled - centre).T))[0]
         if spread < LEAST_SPREAD or np.linalg.norm(centre) > FARTHEST:
             return None
         return centre * np.median(self.norm), float(np.sqrt(rest + centre @ centre) * np.median(self.norm))
@@ -197,8 +197,7 @@ def still_chunks(chunks: Chunks) -> np.ndarray:
     for part in (slice(0, 3), slice(3, 6)):
         scatter = np.linalg.norm(chunks.sd[:, part], axis=1)
         quiet &= scatter <= 3.0 * np.quantile(scatter, 0.1) + 1e-3 * np.median(scatter)
-    direction = chunks.mean[:, :3] / np.maximum(np.linalg.norm(chunks.mean[:, :3], axis=1, keepdims=True), 1e-12)
-    turn = np.linalg.norm(np.diff(direction, axis=0), axis=1)
+    turn = np.linalg.norm(np.diff(unit_rows(chunks.mean[:, :3]), axis=0), axis=1)
     still = quiet & (np.append(turn, 0.0) < MAX_CHUNK_TURN) & (np.append(0.0, turn) < MAX_CHUNK_TURN)
     if still.sum() < LEAST_CHUNKS:
         return still

@@ -8,7 +8,7 @@ import numpy as np
 
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.row_estimate import RowSet
-from imu_calibration.kinematics.rotations import skew
+from imu_calibration.kinematics.rotations import skew, unit_rows
 from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import HandModel
 
@@ -98,8 +98,7 @@ class State:
 def tangent(up: np.ndarray) -> np.ndarray:
     """Return two unit vectors orthogonal to each row of `up`, shape (k, 3, 2)."""
     helper = np.eye(3)[np.argmin(np.abs(up), axis=1)]
-    one = np.cross(up, helper)
-    one /= np.linalg.norm(one, axis=1, keepdims=True)
+    one = unit_rows(np.cross(up, helper))
     return np.stack([one, np.cross(up, one)], axis=2)
 
 
@@ -124,7 +123,7 @@ class GravityRows:
         """Return the state after a step: pose after pose 2 components of its direction and 3 of its drift, then the parameters."""
         own = step[:5 * len(state.up)].reshape(-1, 5)
         up = state.up + np.einsum('kij,kj->ki', tangent(state.up), own[:, :2])
-        return State(state.values + step[own.size:], up / np.linalg.norm(up, axis=1, keepdims=True), state.drift + own[:, 2:])
+        return State(state.values + step[own.size:], unit_rows(up), state.drift + own[:, 2:])
 
     def linearise(self, state: State) -> RowSet:
         """Return the rows of poses, bias drifts, calm drifts and turns at a state."""

@@ -13,6 +13,7 @@ from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, ModelErro
 from imu_calibration.estimation.row_estimate import MAX_NEWTON_STEPS, RowEstimate, estimate_rows
 from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solver import OUTLIER_P_VALUE
+from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.references.gravity.equations import COMPONENTS, SCATTER_SD, GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -69,7 +70,7 @@ def first_state(model: HandModel, poses: Poses) -> State:
     bias, matrix, *_ = model.linear(values)
     true = np.linalg.solve(matrix, (poses.force - bias).T).T
     values[model.gyro_bias] = poses.rate.mean(0)
-    return State(values, true / np.linalg.norm(true, axis=1, keepdims=True), np.zeros_like(poses.rate))
+    return State(values, unit_rows(true), np.zeros_like(poses.rate))
 
 
 def _of_gravity(model, values, relative_sd):

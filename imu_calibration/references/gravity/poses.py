@@ -7,6 +7,7 @@ import numpy as np
 from imu_calibration.core.samples import ImuSamples, rounding_variance
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.references.gravity.equations import Poses
 
 CREEPS = 3.0
@@ -92,7 +93,7 @@ def _pooled_noise(parts, rounding, pieces=8):
 def distinct_attitudes(force: np.ndarray) -> int:
     """Return how many of the mean readings (k, 3) point in directions more than `ATTITUDES_APART` from each other."""
     kept = []
-    for direction in force / np.linalg.norm(force, axis=1, keepdims=True):
+    for direction in unit_rows(force):
         if all(np.arccos(np.clip(direction @ other, -1, 1)) > ATTITUDES_APART for other in kept):
             kept.append(direction)
     return len(kept)
