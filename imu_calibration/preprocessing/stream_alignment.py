@@ -1,5 +1,6 @@
 """Alignment of streams, chunk by chunk of a fixed grid in time: position and phase of the joints at the IMU's stamps."""
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -82,7 +83,7 @@ class MotionChunks:
     """
 
     def __init__(self, settings: WindowSettings, noise_rad: float | None, floors: tuple[QuietFloor, QuietFloor]):
-        self.counts = {}
+        self.counts = Counter()
         self.time_origin = 0.0
         self._settings, self._noise_rad, self._floors = settings, noise_rad, floors
         self._imu, self._joints, self._temperature = SampleBuffer(), SampleBuffer(), SampleBuffer()
@@ -184,8 +185,7 @@ class MotionChunks:
             buffer.forget_before(oldest, keep_one)
 
     def _count(self, reason, number):
-        if number:
-            self.counts[reason] = self.counts.get(reason, 0) + int(number)
+        self.counts += Counter({reason: int(number)})   # without zeros
 
     def _work(self, start_ns, final):
         """Return the chunk from `start_ns` on, or None when no sample in it can be used."""

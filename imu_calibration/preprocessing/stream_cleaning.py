@@ -33,7 +33,7 @@ class StreamCheck:
     """
 
     def __init__(self) -> None:
-        self.counts = {}
+        self.counts = Counter()
         self.epoch = 0
         self._steps = StepHistogram()
         self._n_accepted = 0
@@ -95,8 +95,7 @@ class StreamCheck:
         return [(self._filtered_epoch, part) for part in self._spikes.finish()]
 
     def _count(self, reason, number):
-        if number:
-            self.counts[reason] = self.counts.get(reason, 0) + int(number)
+        self.counts += Counter({reason: int(number)})   # without zeros
 
     def _finite(self, samples):
         columns = [getattr(samples, name).reshape(len(samples), -1) for name in _NEEDED[type(samples)]]
