@@ -31,11 +31,11 @@ def averaging_factors(n_samples: int, per_octave: int = PER_OCTAVE) -> np.ndarra
         return np.zeros(0, np.int64)
     steps = np.arange(int(per_octave * np.log2(n_samples / 2)) + 1)
     wanted = 2.0 ** (steps / per_octave)
-    unit = 2 ** octaves_beyond(wanted)
+    unit = 2 ** _octaves_beyond(wanted)
     return np.unique(np.rint(wanted / unit).astype(np.int64) * unit)
 
 
-def octaves_beyond(factor: np.ndarray) -> np.ndarray:
+def _octaves_beyond(factor):
     """Return the number of halvings of the rate that reduce a factor below `FULL`, integers."""
     return np.maximum(np.ceil(np.log2(np.maximum(factor, 1) / FULL) - 1e-9), 0).astype(np.int64)
 
@@ -59,7 +59,7 @@ class AllanSums:
         self.terms = np.zeros(len(factors), np.int64)
         self.lengths: list[int] = []
         self._until: list[tuple[np.ndarray, np.ndarray]] = [(self.squares.copy(), self.terms.copy())]
-        levels = octaves_beyond(self.factors)
+        levels = _octaves_beyond(self.factors)
         self._levels = [_Level(np.flatnonzero(levels == k), self.factors[levels == k] >> k, n_columns)
                         for k in range(int(levels.max(initial=0)) + 1)]
         self._offset, self._length = None, 0

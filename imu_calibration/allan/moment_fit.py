@@ -374,7 +374,7 @@ def _tails(moments, fit, direction, others, excess):
     size = np.linalg.norm(own)
     score = float(own @ whiten(moments.target - expected)) / size
     weights = whiten.weights(own / size)
-    return pearson_tails(score, third_moment(weights, covariance, np.maximum(expected, 1e-9 * moments.target)))
+    return pearson_tails(score, _third_moment(weights, covariance, np.maximum(expected, 1e-9 * moments.target)))
 
 
 def _beside(own, others):
@@ -385,7 +385,7 @@ def _beside(own, others):
     return own - basis @ (basis.T @ own)
 
 
-def third_moment(weights: np.ndarray, covariance: np.ndarray, expected: np.ndarray) -> float:
+def _third_moment(weights, covariance, expected):
     """
     Return the third central moment of a weighted sum of Allan variances.
 

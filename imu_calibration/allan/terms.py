@@ -226,7 +226,7 @@ class AxisNoise:
 
 def identify_axis(moments: Moments) -> AxisNoise:
     """Return the noise of one axis from its Allan variances."""
-    moments, excess = fit_range(moments)
+    moments, excess = _fit_range(moments)
     moments = replace(moments, scatter=scatter_of(moments))
     choice = choose_form(moments, excess)
     best, rivals = choice.best, choice.rivals
@@ -275,7 +275,7 @@ def predicted(moments: Moments, axis: AxisNoise) -> tuple[np.ndarray, np.ndarray
     return expected, 2.0 / (spread * axis.excess / expected**2 + level)
 
 
-def fit_range(moments: Moments) -> tuple[Moments, float]:
+def _fit_range(moments):
     """
     Return the moments without the averaging times at which the sensor filters its noise, and the remaining misfit.
 

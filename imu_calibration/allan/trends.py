@@ -1,6 +1,5 @@
 """Trends in the readings at rest (temperature, settling after turn-on, steady drift), and noise that is not the same at every rest."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -52,7 +51,7 @@ class AxisTrend:
 
     def at(self, time: np.ndarray, temperature_c: np.ndarray | None, reference: 'TrendReference') -> np.ndarray:
         """Return the trend at instants (s since the beginning), shape (n,)."""
-        return self.value * shape_of(self.name, self.time)(time, temperature_c, reference)
+        return self.value * _shape_of(self.name, self.time)(time, temperature_c, reference)
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class TrendReference:
     """Mean temperature."""
 
 
-def shape_of(name: str, constant: float = 0.0) -> Callable:
+def _shape_of(name, constant=0.0):
     """Return the regressor of a trend as a function of (time, temperature, reference)."""
     return {TEMPERATURE_TREND: lambda time, warmth, reference: warmth - reference.temperature_c,
             TURN_ON_TREND: lambda time, warmth, reference: np.exp(-(time - reference.begin) / constant),
@@ -142,7 +141,7 @@ class TrendSearch:
 
     def columns(self, trends: list[tuple[str, float]]) -> np.ndarray:
         """Return the regressors of (name, time constant), shape (n_blocks, n_trends)."""
-        shapes = [shape_of(*trend)(self.blocks.time, self.blocks.temperature_c, self.reference) for trend in trends]
+        shapes = [_shape_of(*trend)(self.blocks.time, self.blocks.temperature_c, self.reference) for trend in trends]
         return np.column_stack([self._constants, *shapes])[:, self._constants.shape[1]:]
 
     def regress(self, axis: int, trends: list[tuple[str, float]]) -> tuple[np.ndarray, np.ndarray, int]:

@@ -56,7 +56,7 @@ class ArmRows:
     """Length of the windows, s."""
 
 
-def lever_rows(alpha: np.ndarray, products: np.ndarray) -> np.ndarray:
+def _lever_rows(alpha, products):
     """``[alpha x] + omega omega^T - |omega|^2``, shape (n, 3, 3)."""
     return skew(alpha) + products - np.trace(products, axis1=1, axis2=2)[:, None, None] * np.eye(3)
 
@@ -92,7 +92,7 @@ class Fit:
         return rows.T @ self.design[index].reshape(rows.shape)
 
 
-def fit_arm(rows: ArmRows) -> Fit:
+def _fit_arm(rows):
     """
     Solve ``difference = W(alpha, rate) @ arm + bias + delay terms`` with Student-t errors.
 
@@ -110,7 +110,7 @@ def fit_arm(rows: ArmRows) -> Fit:
         When the motion is the same in all windows, or about one axis only and free of noise.
 
     """
-    lever, lever_slope = lever_rows(rows.alpha, rows.products), lever_rows(rows.jerk, rows.products_slope)
+    lever, lever_slope = _lever_rows(rows.alpha, rows.products), _lever_rows(rows.jerk, rows.products_slope)
     count, arm = len(lever), np.zeros(3)
     for number in range(3):  # the delay column needs the arm
         clocks = [-rows.force_slope[:, :, None], (lever_slope @ arm)[:, :, None]]
@@ -165,7 +165,7 @@ def _robust_fit(design, target, alpha_noise):
     return values, weights, weight_fall, excess
 
 
-def jackknife_covariance(fit: Fit, centres: np.ndarray) -> np.ndarray:
+def _jackknife_covariance(fit, centres):
     """Delete-one-cluster jackknife over stretches of time: errors within a stretch may have any correlation."""
     label = np.unique(np.floor((centres - centres[0]) / CLUSTER).astype(int), return_inverse=True)[1]
     shifts = []
@@ -265,7 +265,7 @@ def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples) -> RelativeArm:
     delay = 0.0
     for _ in range(DELAY_ROUNDS):
         rows = _build_rows(a, b, rotation, delay)
-        fit = fit_arm(rows)
+        fit = _fit_arm(rows)
         delay += fit.values[-1]
         if abs(fit.values[-1]) < 1e-5:
             break
@@ -311,7 +311,7 @@ def _calibration_covariance(fit, rows, a, b):
             turn = np.zeros((3, 3))
             turn[p, q] = 1.0
             product = rows.products @ turn.T
-            columns.append(-lever_rows(rows.alpha @ turn.T, product + np.swapaxes(product, 1, 2)) @ fit.values[:3])
+            columns.append(-_lever_rows(rows.alpha @ turn.T, product + np.swapaxes(product, 1, 2)) @ fit.values[:3])
     shift = response(fit, np.stack(columns, axis=2))
     spread = sum(_matrix_covariance(stream.calibration) for stream in (a, b)) / 4  # the mean of both rates is used
     return (shift @ spread @ shift.T)[:3, :3]
@@ -325,7 +325,7 @@ def _matrix_covariance(calibration):
 
 
 def _result(rows, fit, delay, rotation, streams):
-    motion = jackknife_covariance(fit, rows.centres)[:3, :3]
+    motion = _jackknife_covariance(fit, rows.centres)[:3, :3]
     shift = response(fit, -skew(rows.force))
     calibration, turned = _calibration_covariance(fit, rows, *streams), (shift @ rotation.cov @ shift.T)[:3, :3]
     total = motion + calibration + turned

@@ -111,7 +111,7 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
     parts = windows_to_ask(gathered)
     if not parts:
         return EvidentSolution(*first)
-    baseline = baseline_model(options, table, solution.model)
+    baseline = _baseline_model(options, table, solution.model)
     found, *others = (_examined(inquire(windows, table, baseline, bias_processes=options.bias_processes)) for windows in parts)
     found, more = _without_faint(found, solution), _named_elsewhere(found, others)
     added, point = (), {}
@@ -150,7 +150,7 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
     parts = windows_to_ask(gathered)
     if not parts:
         return EvidentSolution(*solved, known)
-    found = inquire(parts[0], table, baseline_model(options, table, solution.model), bias_processes=options.bias_processes)
+    found = inquire(parts[0], table, _baseline_model(options, table, solution.model), bias_processes=options.bias_processes)
     found = _without_faint(_examined(found), solution)
     lacking = [] if found.limits else _beyond(found.adopted, model)   # after a limit was found, the solution is that of the search
     changes = replace(_changes([found], known.added), lacking=tuple(question.name for question in lacking))
@@ -233,7 +233,7 @@ def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
     return replace(options, accelerometer_model=options.accelerometer_model or BARE, reference_model=options.reference_model or 'none')
 
 
-def baseline_model(options: CalibrationOptions, table: Table, solved: SensorModel) -> SensorModel:
+def _baseline_model(options, table, solved):
     """
     Return the baseline model of the search.
 

@@ -89,7 +89,7 @@ def turn_rows(start: np.ndarray | None, end: np.ndarray) -> np.ndarray:
     if angle < TURNED:
         return np.zeros((2, 9))
     across = tangent(end[None])[0].T
-    return (across @ skew(end) @ rotation_slopes(about, angle)).reshape(2, 9)
+    return (across @ skew(end) @ _rotation_slopes(about, angle)).reshape(2, 9)
 
 
 def steps_from(up: np.ndarray | None) -> tuple[tuple[HandStep, ...], np.ndarray]:
@@ -106,7 +106,7 @@ def _steps_from(up):
     return steps, rows
 
 
-def rotation_slopes(about: np.ndarray, angle: float = np.pi) -> np.ndarray:
+def _rotation_slopes(about, angle=np.pi):
     """Return the derivative of the rotation error in the turned frame by the gyroscope's matrix, near the identity, shape (3, 9)."""
     cross = skew(about)
     # integral over the turn of the remaining rotation, C(angle - t)

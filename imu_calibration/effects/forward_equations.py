@@ -1,6 +1,6 @@
 """The columns of a model over a motion, predicted readings, and the model applied to samples."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +24,7 @@ def _shifted_by(lags, motion, roughly):
     return [(weight, shifted(motion, delay)) for weight, delay in delays]
 
 
-def mean_reference(weighted: Sequence[tuple[float, Reference]], motion: JointMotion) -> Reference:
+def _mean_reference(weighted, motion):
     """Return the weighted mean of references (a lag is a mean over delays)."""
     if len(weighted) == 1:
         return weighted[0][1]
@@ -85,7 +85,7 @@ class References:
                 if not isinstance(warp, Lag):
                     table, felt = warp(table, felt, at)
             references.append((weight, reference_motion(table, felt, self.temperature_c, attitude=attitude)))
-        return mean_reference(references, self.motion)
+        return _mean_reference(references, self.motion)
 
 
 def columns(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
@@ -103,13 +103,13 @@ def columns(model: SensorModel, sensor: str, table: Table, *, motion: JointMotio
     warps = {WARP + e.name: e for e in layout.effects if e.warp is not None}
     for name in layout.rows:
         if name in warps:
-            parts += warp_columns(model, warps[name], sensor, references=references)
+            parts += _warp_columns(model, warps[name], sensor, references=references)
         elif name in layout.groups:
             parts.append(layout.groups[name].columns(ref, layout.point))
     return np.concatenate(parts, axis=1)
 
 
-def warp_columns(model: SensorModel, effect: Effect, sensor: str, *, references: References) -> list[np.ndarray]:
+def _warp_columns(model, effect, sensor, *, references):
     """
     Return the columns of a warp: d(true input)/d(parameter), shape (n, 3 size), and d(lever matrix)/d(parameter) where arms are modelled.
 

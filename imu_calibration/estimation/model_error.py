@@ -73,7 +73,7 @@ def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, No
     """
     if len(system.accumulator.blocks) < MIN_SCATTER_BLOCKS or not free.any():
         return ModelError(np.ones(len(values)), *np.zeros((2, len(values))))
-    waves = _waves_of_blocks(*block_scores(system, values, noises), system.prior.root, free)
+    waves = _waves_of_blocks(*_block_scores(system, values, noises), system.prior.root, free)
     found, misfits = errors_of_waves(waves, system.model)
     if 'accelerometer' in misfits:   # an error that depends on the attitude has a mean as large as its scatter, absorbed by the bias
         offset = system.model.part('accelerometer', Role.OFFSET)
@@ -101,22 +101,22 @@ def errors_of_waves(waves: 'CosineScores', model: SensorModel) -> tuple[ModelErr
     factor, more = np.ones(size), np.zeros(size)
     for sensor in {effect.sensor for effect in model.effects}:
         shown = [group for effect in model.effects if effect.sensor == sensor and len(group := waves.group(model.slices[effect.key]))]
-        if shown and fisher([waves.drift(group)[0] for group in shown]) < CHANCE:
+        if shown and _fisher([waves.drift(group)[0] for group in shown]) < CHANCE:
             for group in shown:
                 more[waves.places[group]] = waves.drift(group)[1]
-        if shown and fisher([waves.scatter(group)[0] for group in shown]) < CHANCE:
+        if shown and _fisher([waves.scatter(group)[0] for group in shown]) < CHANCE:
             misfits.add(sensor)
             for group in shown:
                 factor[waves.places[group]] = np.sqrt(waves.scatter(group)[1])
     return ModelError(factor, more, np.zeros(size)), misfits
 
 
-def fisher(p_values: list[float]) -> float:
+def _fisher(p_values):
     """Return the p-value of several independent ones together (Fisher)."""
     return float(chi2_sf(-2 * np.log(np.maximum(p_values, 1e-300)).sum(), 2 * len(p_values)))
 
 
-def block_scores(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> tuple[np.ndarray, np.ndarray]:
+def _block_scores(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> tuple[np.ndarray, np.ndarray]:
     """Return the information of each block of windows, shape (k, n_params, n_params), and its part of the gradient, shape (k, n_params)."""
     blocks = system.accumulator.blocks
     information, gradient = np.zeros((len(blocks),) + (len(values),) * 2), np.zeros((len(blocks), len(values)))

@@ -92,7 +92,7 @@ def estimate_rows(reference: RowReference, state: Any, *, fallback: np.ndarray) 
     """
     asked, priors = ~reference.fixed, reference.priors
     state, scatter, steps = _iterate(reference, state, asked, priors, variance=fallback, fallback=fallback)
-    held = choose_held(_factor(reference.linearise(state), scatter), priors, asked)
+    held = _choose_held(_factor(reference.linearise(state), scatter), priors, asked)
     free = asked & ~held
     state = replace(state, values=np.where(held, reference.nominal, state.values))
     start = np.maximum(scatter.variance, 0.01 * fallback)
@@ -105,7 +105,7 @@ def estimate_rows(reference: RowReference, state: Any, *, fallback: np.ndarray) 
     return RowEstimate(state, terms, held, free, scatter, factor, steps + more)
 
 
-def choose_held(factor: np.ndarray, priors: np.ndarray, asked: np.ndarray) -> np.ndarray:
+def _choose_held(factor, priors, asked):
     """
     Return which of the parameters `asked` (mask) have next to no information from the data, shape (n,).
 

@@ -31,7 +31,7 @@ LEAST_SEEN = 0.05
 """A window whose error keeps less than this share in the residuals is not tested."""
 
 
-def outlier_windows(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> dict[str, frozenset]:
+def _outlier_windows(system, values, noises):
     """
     Return sensor -> keys of the outlying windows by kind, without the ones that the noise model excludes already.
 
@@ -114,8 +114,7 @@ REST_NOISE_MARGIN = 1.1
 """Residuals up to this times the variance at rest are noise: the rest used for its estimate may have been quieter."""
 
 
-def implausible_estimates(system: WeightedSystem, values: np.ndarray, *, sd: np.ndarray, noises: dict[str, NoiseModel],
-                          free: np.ndarray) -> np.ndarray:
+def _implausible_estimates(system, values, *, sd, noises, free):
     """
     Return a mask of the parameters whose information may be an artefact of misfit.
 
@@ -210,7 +209,7 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
     if noise is None:
         values, noises = _with_noise(system, values, noises, free)
         for _ in range(LEAVING_ROUNDS):
-            more = outlier_windows(system, values, noises)
+            more = _outlier_windows(system, values, noises)
             if not any(more.values()):
                 break
             smaller = {s: replace(noises[s], left_out=noises[s].left_out | more[s]) for s in SENSORS}
@@ -225,7 +224,7 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
             values = _minimised(system, np.where(held, prior.mean, values), factors, free & ~held)
         data = system.jacobian(values, factors)
         own, of_held = covariance_with_held(np.concatenate([data, prior.root]), free & ~held, held, prior_sd=prior.sd)
-        strange = implausible_estimates(system, values, sd=np.sqrt(np.diag(own + of_held)), noises=noises, free=free & ~held)
+        strange = _implausible_estimates(system, values, sd=np.sqrt(np.diag(own + of_held)), noises=noises, free=free & ~held)
         if not allow_holding or not strange.any() or (held | strange | ~free).all():
             break
         not_believed |= {name: float(value) for name, value, flag in zip(model.param_names, values, strange) if flag}

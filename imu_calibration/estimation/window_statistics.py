@@ -174,7 +174,7 @@ def reduce_window(window: Window, model: SensorModel, table: Table, *, session: 
 
 def _reduced(window, designs, session, inputs):
     outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
-    static, length = window.kind == 'static', piece_length(window)
+    static, length = window.kind == 'static', _piece_length(window)
     sensors = {s: _reduce_static(designs[s], outputs[s]) if static else _reduce_moving(designs[s], outputs[s], length) for s in SENSORS}
     duration = float(window.time[-1] - window.time[0])
     pieces = {}
@@ -202,7 +202,7 @@ def _reduce_moving(design, output, length):
     return SensorStatistics(mean, triangular(rows), rounding_variance(output), unknown, triangular(slow), len(slow))
 
 
-def piece_length(window: Window) -> int:
+def _piece_length(window):
     """Return the number of samples in SLOW_TIME, at least one; zero for a static window."""
     if window.kind == 'static':
         return 0

@@ -54,9 +54,9 @@ COVARIANCE = _of(
     ('drifts do not widen standard deviations', 'errors_of_waves', '_1.drift(_2)[1]', '0.0',
      'test_model_error.py::test_a_parameter_that_drifts_has_a_standard_deviation_that_repeats'),
     ('standard deviations widen by chance', 'CHANCE', '...', '0.9', 'test_model_error.py::test_clean_sessions_stay_as_they_are'),
-    ('values that only misfit gives are believed', 'implausible_estimates', '_1 > _limit(_2)', '_1 < 0',
+    ('values that only misfit gives are believed', '_implausible_estimates', '_1 > _limit(_2)', '_1 < 0',
      'test_believing.py::test_a_scale_that_only_misfit_gives_is_held_and_named'),
-    ('a wrong full scale is taken for misfit', 'implausible_estimates', '_1[_2] & (_3 > _limit(_4)) & (_3 < _5[_2] * max((_6[_7] for _7 in _8)))',
+    ('a wrong full scale is taken for misfit', '_implausible_estimates', '_1[_2] & (_3 > _limit(_4)) & (_3 < _5[_2] * max((_6[_7] for _7 in _8)))',
      '_1[_2] & (_3 > _limit(_4))', 'test_believing.py::test_a_wrong_full_scale_setting_is_no_misfit'),
     ('unasked values do not shrink', 'shrunk', '1.0', '0.0',
      'test_believing.py::test_what_nobody_asked_for_shrinks_and_what_is_plain_stays'),
@@ -238,7 +238,7 @@ HAND = _of(
      'test_hand_faults.py::test_times_are_those_of_the_clock_that_jittering_stamps_follow'),
 )
 ALLAN = _of(
-    ('white noise lost behind a vibration', 'fit_range', '_1 and _2.misfit / _3 < _4', 'True and _2.misfit / _3 < _4',
+    ('white noise lost behind a vibration', '_fit_range', '_1 and _2.misfit / _3 < _4', 'True and _2.misfit / _3 < _4',
      'test_noise_identification.py::test_a_vibration_does_not_hide_the_white_noise'),
     ('forms told apart by what none explains', 'log_cost', 'float(_1 @ _1) / _2', 'float(_1 @ _1)',
      'test_noise_identification.py::test_forms_of_a_curve_that_none_explains_are_told_apart_less'),

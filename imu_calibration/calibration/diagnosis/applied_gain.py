@@ -14,7 +14,6 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import judged_from_of, uncorrected_in_time, uncorrected_on_table
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import References, applied_values, not_applied, sensor_output
-from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import all_samples, chunks
@@ -47,7 +46,7 @@ def gain_of_findings(found: Investigation, table: Table, before: Sequence[Questi
     if applied is None:
         return heldout_gain(problem, before, after, sensors=sensors)
     chosen = gain_in_turn(problem, *applied, sensors=sensors)
-    sides, sums = [applied_parameters(found, some) for some in applied], DistanceSums()
+    sides, sums = [_applied_parameters(found, some) for some in applied], DistanceSums()
     start = max(judged_from_of(model, problem.duration) for model, *_ in sides)
     held_out = [window for window, locked in zip(found.used, problem.locked) if locked and window.time[0] >= start]
     for group in chunks(held_out):
@@ -63,7 +62,7 @@ def _compensated(found, before, after):
     return sides if any(question.effect.compensation == 'exact' for question in additional) else None
 
 
-def applied_parameters(found: Investigation, chosen: Sequence[Question]) -> tuple[SensorModel, np.ndarray, np.ndarray]:
+def _applied_parameters(found, chosen):
     """Return (model, values, values as compensation applies them) of a choice of effects, estimated without the locked windows."""
     problem, wide = found.problem, found.problem.recording.model
     model = replace(problem.baseline, temperature_ref_c=wide.temperature_ref_c)

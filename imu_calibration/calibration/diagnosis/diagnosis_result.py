@@ -144,7 +144,7 @@ def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
         'dead_reckoning': diagnosis.traces.dead_reckoning,
         'simulation_distance': {sensor: each.to_mapping() for sensor, each in diagnosis.traces.distances.items()},
         'unexplained': {sensor: _rest(sensor, diagnosis.unexplained[sensor], diagnosis.locked) for sensor in SENSORS},
-        'not_testable': list(diagnosis.not_testable),
+        'not_testable': diagnosis.not_testable,
         'candidates': [_candidate(candidate) for candidate in diagnosis.candidates],
         'windows': {'used': diagnosis.windows, 'held_out_for_the_gain': diagnosis.locked}})
 
@@ -157,7 +157,7 @@ def _candidate(candidate):
 
 def _baseline(solution, sensor):
     model = solution.model
-    return {'effects': list(getattr(model, sensor)), 'reference_effects': list(model.reference),
+    return {'effects': getattr(model, sensor), 'reference_effects': model.reference,
             'residual_rms': solution.residual_rms[sensor][0], 'window_mean_rms': solution.residual_rms[sensor][1],
             'noise_rms': np.sqrt(np.mean(solution.noise[sensor].white_variance))}
 
@@ -166,20 +166,20 @@ def _finding(finding):
     return {'effect': finding.effect, 'sensor': finding.sensor, 'explanation': finding.explanation,
             'parameters': {name: {'value': value, 'sd': sd, 'unit': unit} for name, (value, sd, unit) in finding.parameters.items()},
             'p_value': finding.p_value, 'heldout_log_likelihood_gain': finding.heldout_gain, 'share_of_unexplained': finding.share,
-            'gain': _gain(finding.gain), 'indistinguishable_from': list(finding.indistinguishable_from),
+            'gain': _gain(finding.gain), 'indistinguishable_from': finding.indistinguishable_from,
             'sizes_of_mates': {mate: {name: {'value': value, 'unit': unit} for name, (value, unit) in sizes.items()}
                                for mate, sizes in finding.sizes_of_mates.items()},
             'separating_motion': finding.separating_motion, 'implausible': finding.implausible}
 
 
 def _gain(gain):
-    return {'sensor': gain.sensor, 'of': gain.of, 'measure': gain.measure, 'heldout_rms_before': gain.heldout_rms_before,
-            'heldout_rms_after': gain.heldout_rms_after, 'reduction': gain.reduction, 'ci95': list(gain.ci95), 'windows': gain.windows}
+    names = ('sensor', 'of', 'measure', 'heldout_rms_before', 'heldout_rms_after', 'reduction', 'ci95', 'windows')
+    return {name: getattr(gain, name) for name in names}
 
 
 def _rest(sensor, rest, locked):
     unit = rest.unit or UNITS[sensor]
     return {'significant': rest.significant, 'rms': rest.rms, 'unit': unit, 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
-            'share': rest.share, 'where': '; '.join(regime.text for regime in rest.regimes) or None, 'axes': list(rest.axes),
+            'share': rest.share, 'where': '; '.join(regime.text for regime in rest.regimes) or None, 'axes': rest.axes,
             'regimes': [regime.to_mapping() for regime in rest.regimes], 'tones': [tone.to_mapping() for tone in rest.tones],
             'proposals': [] if rest.proposal is None else [rest.proposal.to_mapping() | {'gain': _gain(formula_gain(rest, locked))}]}

@@ -19,7 +19,7 @@ from imu_calibration.calibration.table_calibration import conclude, solve_record
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.verdict import misfits, unsteady
-from imu_calibration.effects.base import SENSORS, UNITS, Effect, Role
+from imu_calibration.effects.base import SENSORS, UNITS, Role
 from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
 from imu_calibration.estimation.window_statistics import reduce_window
@@ -140,7 +140,7 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
 
 def _with_proposals(source, table, options, result, diagnosis, provenance, reader):
     """Return the calibration of the extended model with the proposed formulas, or None without a formula."""
-    effects = proposed_effects(diagnosis)
+    effects = _proposed_effects(diagnosis)
     if not effects:
         return None
     model = result.calibration.model
@@ -193,13 +193,13 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
         if finding.indistinguishable_from:
             lines.append(f'   not separable in this recording from {", ".join(finding.indistinguishable_from)}; '
                          f'to separate them: {finding.separating_motion}')
-    if not diagnosis.findings and not proposed_effects(diagnosis):
+    if not diagnosis.findings and not _proposed_effects(diagnosis):
         lines.append(nothing_named(diagnosis))
     for sensor, rest in diagnosis.unexplained.items():
         if rest.significant:
             with_what = f'; it correlates with {rest.correlates_with}' if rest.correlates_with else ''
             lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}')
-        lines += [f'   {line}' if rest.significant else line for line in (*beyond_lines(sensor, rest), *formula_lines(sensor, rest))]
+        lines += [f'   {line}' if rest.significant else line for line in (*beyond_lines(sensor, rest), *_formula_lines(sensor, rest))]
     if diagnosis.not_testable:
         lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
     return lines
@@ -229,7 +229,7 @@ def beyond_lines(sensor: str, rest: Unexplained) -> list[str]:
     return [*lines, *(f'spectrum: {tone.text}' for tone in rest.tones)]
 
 
-def formula_lines(sensor: str, rest: Unexplained) -> list[str]:
+def _formula_lines(sensor, rest):
     """Return the formula that an unexplained residual follows and its gain, as lines."""
     if rest.proposal is None:
         return []
@@ -239,7 +239,7 @@ def formula_lines(sensor: str, rest: Unexplained) -> list[str]:
             'after (95 %)']
 
 
-def proposed_effects(diagnosis: Diagnosis) -> list[Effect]:
+def _proposed_effects(diagnosis):
     """Return the formulas of a diagnosis as effects."""
     return [effect for rest in diagnosis.unexplained.values() if rest.proposal is not None for effect in rest.proposal.effects]
 

@@ -18,7 +18,7 @@ def _with_residuals(hand):
     return replace(hand, residual_rms={sensor: np.full(2, np.sqrt(np.mean(residual**2))) for sensor, residual in residuals.items()})
 
 
-def traces_of(baseline: HandCalibration, hand: HandCalibration) -> Traces:
+def _traces_of(baseline, hand):
     """Return the `Traces` of two calibrations: one point per pose, the accelerometer's residual along gravity."""
     poses = hand.poses
     true = hand.gravity * hand.state.up
@@ -41,4 +41,4 @@ def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
     gain = gain_by_hand(found, [], after=named, sensor=named[0].sensor) if named else None
     count = len(found.baseline.poses.start)
     return Diagnosis(findings, found.unexplained, candidates_of(problem.search, named),
-                     tuple(found.not_testable), before, after, gain, count, count if named else 0, traces_of(found.baseline, hand))
+                     tuple(found.not_testable), before, after, gain, count, count if named else 0, _traces_of(found.baseline, hand))

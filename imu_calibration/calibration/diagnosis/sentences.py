@@ -1,7 +1,6 @@
 """Findings as sentences, and motions that separate effects."""
 
-from collections.abc import Callable, Collection, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.search import FAMILY_WISE, Score, Search
+from imu_calibration.selection.search import FAMILY_WISE, Search
 
 MIN_EVIDENCE_GROWTH = 9.0
 """Least growth of the evidence that a motion must promise, in squared standard deviations."""
@@ -127,7 +126,7 @@ def candidates_of(search: Search, named: Sequence[Question], *, agree: Callable[
         if question.name in rows and rows[question.name].gain_alone >= alone.gain:
             continue
         beside = None if question.name in found else search.score(named, question)
-        verdict = verdict_of(question.name, alone, beside, found=found, mates=mates)
+        verdict = _verdict_of(question.name, alone, beside, found=found, mates=mates)
         if verdict == LEAVES_MOST and agree is not None and not agree([*named, question], question):
             verdict = DISAGREED
         rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, None if beside is None else beside.gain,
@@ -135,7 +134,7 @@ def candidates_of(search: Search, named: Sequence[Question], *, agree: Callable[
     return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
 
 
-def verdict_of(name: str, alone: Score, beside: Score | None, *, found: Collection[str], mates: dict[str, Any]) -> str:
+def _verdict_of(name, alone, beside, *, found, mates):
     """
     Return 'found', 'as good as NAME', 'not needed in addition to the findings', 'no evidence', or why the effect was refused.
 

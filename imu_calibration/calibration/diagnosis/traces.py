@@ -129,12 +129,10 @@ class DistanceSums:
     def gains(self, sensor: str, of: str = OF_MODEL) -> dict[str, Gain]:
         """Return measure -> Gain of the windows up to now, in the order of `MEASURES`."""
         n, rest, *squares = np.array(self._rows[sensor]).T
-        models, still, found = (squares[:2], squares[2:]), rest > 0, {}
+        models, still = (squares[:2], squares[2:]), rest > 0
         pairs = ([(within + n * mean, 3 * n) for within, mean in models], [(mean, 0 * n + 3) for _, mean in models],
                  [(within, 3 * (n - 1)) for within, _ in models], [(mean[still], 3 + 0 * mean[still]) for _, mean in models])
-        for measure, pair in zip(MEASURES, pairs):
-            found[measure] = gain_of(sensor, measure, pair, of=of)
-        return found
+        return {measure: gain_of(sensor, measure, pair, of=of) for measure, pair in zip(MEASURES, pairs)}
 
 
 PLOT_BLOCK_SECONDS = 0.25
