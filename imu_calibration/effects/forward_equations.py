@@ -42,6 +42,8 @@ class References:
 
     def __init__(self, model: SensorModel, table: Table, motion: JointMotion, *, temperature_c: np.ndarray | None = None):
         self.model, self.table, self.motion, self.temperature_c = model, table, motion, temperature_c
+        self._warps = {sensor: [(each, model.point_of(each)) for each in model.concerning(sensor) if each.warp is not None]
+                       for sensor in SENSORS}
         self._known: dict[tuple, Reference] = {}
         self._shifts: dict[tuple, list] = {}
 
@@ -64,9 +66,9 @@ class References:
         moved = None
         if effect is not None and values is not None and np.any(values != self.model.point_of(effect)):
             moved = effect.key
-        for each in self.model.concerning(sensor):
-            at = values if each.key == moved else self.model.point_of(each)
-            if each.warp is not None and np.any(at):
+        for each, point in self._warps[sensor]:
+            at = values if each.key == moved else point
+            if np.any(at):
                 acting.append((each.name, each.warp, at))
         key = (roughly, moved, *((name, *at) for name, _, at in acting))
         if key not in self._known:

@@ -29,6 +29,8 @@ EXPLANATIONS = 4
 """Explanations of the lags that are tried, at most."""
 LEFT = 0.1
 """Largest remaining share of a significant excess after pairs, or effects of implausible size."""
+HOPELESS = 3 * LEFT
+"""The same before they are relinearised: a larger share is not tried, because each trial needs up to eight linearisations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +106,9 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
         longer = max([w for w in used if w.time[-1] < onset.time], [w for w in used if w.time[0] >= onset.time], key=len)
         return replace(investigate(longer, table, model, bias_processes=bias_processes), onset=onset)
     linearised_at = again
+    tried = {_labels(outcome.chosen)}
     for any_size in (False, True):
-        outcome = _looked_again(outcome, partial(linearised_at, any_size=any_size), any_size)
+        outcome = _looked_again(outcome, partial(linearised_at, any_size=any_size), any_size, tried)
     problem, named, unstable = outcome.problem, outcome.named, outcome.unstable
     names = {question.name for question in named}
     rivals = [rival for rival in rivals if rival.question.name in names and rival.other.name not in names]
@@ -162,15 +165,16 @@ class _Trial:
         return self.rank[0] == len(self.lags)
 
     def finished(self, linearised_at):
-        """Return the trial without the lags that are not named; its rank may only fall."""
-        return replace(self, outcome=_without_unnamed(self.outcome, linearised_at))
+        """Return the trial relinearised at its choice, without the lags that are not named."""
+        return replace(self, outcome=_settled(linearised_at, self.outcome.problem, self.outcome.chosen))
 
 
 def _with_lags(explanations, linearised_at):
     """
     Return (the _Outcome with the simplest explanation of the lags all of which help, its rivals).
 
-    Where one of several effects does not help, a shorter one is tried, where a single one does not, another.
+    Where one of several effects does not help, a shorter one is tried, where a single one does not, another. Only a trial that helps where
+    it begins, or the best of all, is relinearised at its choice.
     """
     most, refused, tried = None, [], []
     for number in range(EXPLANATIONS):
@@ -178,7 +182,7 @@ def _with_lags(explanations, linearised_at):
         there, chosen, of_lags = explanations.settled(selected, linearised_at)
         chosen = there.search.run(chosen)
         settled, rivals = settle_rivals(there, chosen, linearised_at)
-        outcome = _relinearised(linearised_at, settled, chosen if settled is there else _searched(settled, chosen))
+        outcome = _outcome(settled, chosen if settled is there else _searched(settled, chosen))
         trial = _Trial(number, selected.lags.keys(), outcome, [*of_lags, *rivals])
         if trial.helps and (trial := trial.finished(linearised_at)).helps:
             return trial.outcome, trial.rivals
@@ -200,22 +204,28 @@ def _best_of(trials, linearised_at):
     return best
 
 
-def _looked_again(outcome, linearised_at, any_size):
+def _labels(chosen):
+    return frozenset(question.label for question in chosen)
+
+
+def _looked_again(outcome, linearised_at, any_size, tried):
     """
     Return the _Outcome of the searches for the cause of a remaining significant excess.
 
     Further searches start from pairs, or allow implausible sizes. Any two of many effects reduce an excess of
-    a different cause somewhat: together they must remove nearly all.
+    a different cause somewhat: together they must remove nearly all. `tried` has the labels of each choice that was linearised.
     """
     if not outcome.rest:
         return outcome
     problem = outcome.problem.asking_any_size() if any_size else outcome.problem
-    search, known = problem.search, {question.label for question in outcome.chosen}
+    search = problem.search
     lags = _resolved(problem, outcome.chosen)
     found = [search.run([*lags, *start]) for start in ((), *best_pairs(search))]
     best = min(found, key=search.cost)
-    if {question.label for question in best} == known or (not any_size and search.cost(best) >= search.cost(outcome.chosen)):
+    if _labels(best) in tried or outcome.explained.rest(best) >= HOPELESS * outcome.rest or \
+            (not any_size and search.cost(best) >= search.cost(outcome.chosen)):
         return outcome
+    tried.add(_labels(best))
     other = _settled(linearised_at, problem, best)
     return other if other.rest < LEFT * outcome.rest else outcome
 
@@ -232,6 +242,11 @@ def _relinearised(linearised_at, problem, chosen):
             break
         problem = linearised_at(point=problem.point(chosen))
         chosen = _searched(problem, chosen)
+    return _outcome(problem, chosen)
+
+
+def _outcome(problem, chosen):
+    """Return the _Outcome of a choice where it is linearised."""
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
     explained = ExplainedWindows(problem.evidence, problem.search)

@@ -57,7 +57,7 @@ def test_a_pair_of_which_one_does_nothing_does_not_survive():
 
 def outcome(search, named, rest):
     problem = SimpleNamespace(search=search)
-    return SimpleNamespace(problem=problem, chosen=named, named=named, rest=rest)
+    return SimpleNamespace(problem=problem, chosen=named, named=named, rest=rest, explained=SimpleNamespace(rest=lambda chosen: 0.0))
 
 
 @pytest.mark.parametrize(('rest', 'remaining', 'found'), ((0.0, -1.0, set()), (50.0, -1.0, set(NAMES[:2])), (50.0, 10.0, set())),
@@ -65,4 +65,4 @@ def outcome(search, named, rest):
 def test_pairs_are_tested_for_a_remaining_excess(monkeypatch, rest, remaining, found):
     search = searched((1.0, 0.6, -0.6, 0.0, 0.0), 0.95)
     monkeypatch.setattr(investigation, '_settled', lambda linearised_at, problem, chosen: outcome(search, chosen, remaining))
-    assert names(investigation._looked_again(outcome(search, [], rest), None, False).named) == found
+    assert names(investigation._looked_again(outcome(search, [], rest), None, False, set()).named) == found

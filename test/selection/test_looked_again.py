@@ -1,0 +1,44 @@
+"""A further search is linearised only where it may remove nearly all of an excess, and once for each choice."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from imu_calibration.selection import investigation
+from imu_calibration.selection.investigation import HOPELESS, LEFT
+
+
+@pytest.fixture
+def looked_again(monkeypatch):
+    """Return a function: rest of the best choice before and after it is linearised -> (rest of the outcome, number of trials)."""
+    def look(before, after):
+        best, trials = [SimpleNamespace(label='bent', name='bent')], []
+        search = SimpleNamespace(run=lambda start: best, resolved=(), cost=len)
+        problem = SimpleNamespace(search=search, questions=[])
+        problem.asking_any_size = lambda: problem
+        first = SimpleNamespace(rest=100.0, problem=problem, chosen=[SimpleNamespace(label=label, name=label) for label in ('one', 'two')],
+                                explained=SimpleNamespace(rest=lambda chosen: before))
+        monkeypatch.setattr(investigation, 'best_pairs', lambda search: [])
+
+        def settled(linearised_at, problem, chosen):
+            trials.append(chosen)
+            return SimpleNamespace(rest=after)
+        monkeypatch.setattr(investigation, '_settled', settled)
+        outcome, tried = first, set()
+        for any_size in (False, True):
+            if outcome is first:
+                outcome = investigation._looked_again(outcome, None, any_size, tried)
+        return outcome.rest, len(trials)
+    return look
+
+
+def test_a_choice_that_removes_nearly_all_is_adopted(looked_again):
+    assert looked_again(100.0 * LEFT, 0.0) == (0.0, 1)
+
+
+def test_a_choice_that_leaves_much_is_not_linearised(looked_again):
+    assert looked_again(100.0 * HOPELESS, 0.0) == (100.0, 0)
+
+
+def test_a_choice_is_linearised_once(looked_again):
+    assert looked_again(100.0 * LEFT, 100.0 * LEFT) == (100.0, 1)
