@@ -33,10 +33,9 @@ from imu_calibration.nodes.playback import PLAYBACK_DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import CAUSES, GRADES, hidden_causes
-from imu_calibration.simulation.session import LiveSimulation, SimulationOptions
+from imu_calibration.simulation.session import LiveSimulation, SimulationOptions, true_imu
 from imu_calibration.simulation.table_controller import ControllerSettings, TableController
 from imu_calibration.use_cases.resources import config_file
-from imu_calibration.use_cases.simulate import true_imu
 from msg_adapters.joint_state import trajectory_from_message
 from msg_adapters.layout import Packed
 from msg_adapters.write import encode_imu, encode_joints, encode_temperature
@@ -100,8 +99,8 @@ class SimulatorNode(Node):
                                               *['imu/truth'] * settings.truth, *['/clock'] * settings.clock])
         self._table, self._motion = self._make_table()
         imu_seed = settings.seed if settings.imu_seed < 0 else settings.imu_seed
-        truth_file = files.user_path(settings.calibration_file) if settings.calibration_file else None
-        model, values = true_imu(self._table, truth_file, settings.grade, seed=imu_seed)
+        truth = files.read_calibration(files.user_path(settings.calibration_file)) if settings.calibration_file else None
+        model, values = true_imu(self._table, (truth.model, truth.values) if truth else None, settings.grade, seed=imu_seed)
         start_ns = int(settings.start_time * 1e9) or time.time_ns()
         causes = hidden_causes(settings.hide.split('+') if settings.hide else [], imu_seed, settings.hide_size)
         self._simulation = LiveSimulation(model, values, self._table, motion=self._motion, options=self._options(), seed=settings.seed,

@@ -8,8 +8,9 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples
 from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.forward_equations import References, clip, predict
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.rotations import lever_matrix
 from imu_calibration.kinematics.signal_history import HALF_WIDTH
@@ -95,6 +96,23 @@ def random_values(model: SensorModel, grade: str = 'industrial', seed: int = 0) 
             arms = rng.normal(0.0, grade.arm, (3, 3))
             values[part] = (arms - arms.mean(axis=0)).ravel()
     return values
+
+
+def true_imu(table: Table, known: tuple[SensorModel, np.ndarray] | None, grade: str, *, seed: int,
+             catalogue: Catalogue = CATALOGUE) -> tuple[SensorModel, np.ndarray]:
+    """Return (model, values): the known ones, or those of a random IMU of a grade with size effect."""
+    if known is None:
+        model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names, catalogue=catalogue)
+        return model, random_values(model, grade, seed)
+    require_joints(known[0], table)
+    return known
+
+
+def require_joints(model: SensorModel, table: Table) -> None:
+    """Refuse a model with effects of the reference for joints that differ from those of the table."""
+    if model.reference and set(model.joint_names) != set(table.joint_names):
+        raise InputError(f"the calibration must be of a table with joints {', '.join(table.joint_names)}, it names "
+                         f"{', '.join(model.joint_names)}; give its table", key='table')
 
 
 def hidden_effect(model: SensorModel, name: str, seed: int = 0, *, share: float = 0.3, moment: float = 60.0) -> tuple[str, np.ndarray]:

@@ -7,8 +7,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Unpack, cast
 
-import numpy as np
-
 from imu_calibration.core import documents
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import report
@@ -17,14 +15,13 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration, true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
+from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.replay import BIAS_TIME, ReplayNoise
 from imu_calibration.simulation.replay import replay as run_replay
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values
+from imu_calibration.simulation.session import SimulationOptions, hidden_effect, require_joints, true_imu
 from imu_calibration.simulation.session import simulate as run_session
 from imu_calibration.use_cases.choices import Choices, catalogue_of, check_names, topics_of
 from imu_calibration.use_cases.recordings import name_of, source_of
@@ -103,7 +100,9 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
     given = table_of(table or config_file('table_simulated.yaml'))
     motion = make_profile(profile, seed, given, duration=duration)
     mover = given if motion.table is None else Table.from_mapping(motion.table)
-    model, values = true_imu(mover, calibration, grade, seed=seed if imu_seed is None else imu_seed, catalogue=catalogue_of(catalogue))
+    given_imu = None if calibration is None else files.given_calibration(calibration)
+    model, values = true_imu(mover, (given_imu.model, given_imu.values) if given_imu else None, grade,
+                             seed=seed if imu_seed is None else imu_seed, catalogue=catalogue_of(catalogue))
     for name in effects:
         sensor, hidden = hidden_effect(model, name, seed, share=size, moment=0.6 * motion.duration)
         model, values = replace(model, point={}).with_sized_effect(values, sensor, name, size=hidden)
@@ -147,7 +146,7 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
     topics = topics_of(choices)
     given = table_of(table, [recording], topics, gravity=choices.get('gravity'))
     known = files.given_calibration(calibration)
-    _require_joints(known, given)
+    require_joints(known.model, given)
     noise = None
     if all('noise_sd' in known.statistics.get(sensor, {}) for sensor in SENSORS):
         noise = {sensor: ReplayNoise(*known.noise(sensor), known.statistics[sensor].get('wander_time_s') or BIAS_TIME)
@@ -158,22 +157,3 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
     truth = replace(known, provenance={'simulated': {'seed': seed, 'replay': name_of(recording)}})
     stamps = cast(ImuSamples, samples.imu).stamp_ns
     return Simulated(samples, given, truth, 1e-9 * float(stamps[-1] - stamps[0]), lost)
-
-
-def true_imu(table: Table, calibration: str | PathLike | Calibration | None, grade: str, *, seed: int,
-             catalogue: Catalogue = CATALOGUE) -> tuple[SensorModel, np.ndarray]:
-    """Return (model, values) of a calibration, or of a random IMU of a grade with size effect."""
-    if calibration is None:
-        model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names, catalogue=catalogue)
-        return model, random_values(model, grade, seed)
-    known = files.given_calibration(calibration)
-    _require_joints(known, table)
-    return known.model, known.values
-
-
-def _require_joints(calibration, table):
-    """Refuse a calibration with effects of the reference for joints that differ from those of the table."""
-    names, known = table.joint_names, calibration.model.joint_names
-    if calibration.model.reference and set(known) != set(names):
-        raise InputError(f"the calibration must be of a table with joints {', '.join(names)}, it names {', '.join(known)}; give its table",
-                         key='table')

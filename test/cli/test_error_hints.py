@@ -65,7 +65,7 @@ UNREACHABLE = {
                      'calibration': 'with a plan for separation alone', 'diagnose': 'no calibration is estimated', 'inspect': 'no calibration is estimated',
                      'temperature_topic': 'no recording is replayed', 'up': 'of transforms in a bag',
                      'target_frame': 'no calibration is applied'},
-    'simulator_node': {'temperature_topic': 'no recording is replayed', 'up': 'of transforms in a bag'},
+    'simulator_node': {'up': 'of transforms in a bag'},
     'compensator_node': {'allow_xacro': 'no robot description is read', 'imu_link': 'no robot description is read', 'up': 'of transforms in a bag'},
     'bag_player_node': {'allow_xacro': 'no robot description is read'},
 }
