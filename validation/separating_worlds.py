@@ -1,11 +1,11 @@
 """
-Does the motion that is planned to tell causes apart leave the right name? ``PYTHONPATH=test python -m validation.separating_worlds``.
+Does a motion planned to separate causes leave the correct name? ``PYTHONPATH=test python -m validation.separating_worlds``.
 
-A physical cause is hidden in a unit on a table, and a short round is driven by habit: the faces, one spin about each axis, a swing. Where the diagnosis
-of that names a class of effects that it cannot tell apart, the planner makes at most three minutes of motion for the same unit, and the diagnosis is asked
-again about all of it together; where a class is left still the planner makes another motion in what is left of the three minutes. It is right when it then
-names what was hidden, with nothing that would do as well. Effects that the plan says beforehand to be alike whatever that table does in three minutes, lags
-of one sensor by a tenth of a millisecond above all, are one cause for it: a class of these with what was hidden is counted apart.
+A physical cause is hidden in a unit on a table, and a short recording is made with the usual motions: the faces, one spin about each axis, a swing. If
+its diagnosis names a class of confounded effects, the planner makes at most three minutes of motion for the same unit, and both recordings are diagnosed
+together; if a class remains, the planner makes another motion in the remaining time. The result is correct if the hidden effect is then named, without
+alternatives. Effects that the plan reports as confounded in any motion of that table of three minutes, mainly lags of one sensor within a tenth of a
+millisecond, are one cause: a class of these with the hidden effect is counted separately.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from worlds.physics import Session, make_session
 from worlds.physics_draw import generator, to_ns
 
 HIDDEN = ('accel_quadratic', 'gyro_bandwidth', 'accel_scale_asymmetry', 'gyro_quadratic', 'time_offset', 'gyro_scale_asymmetry', 'accel_bandwidth')
-"""What shows with motion and has relatives that a short round seldom tells from it."""
+"""Effects that depend on motion and are often confounded with others in a short recording."""
 FACTORS = (2.5, 4.0)
-"""Sizes, as multiples of what is just detectable in the first round; the larger, the more seldom a class is left."""
+"""Sizes, as multiples of the smallest detectable size in the first recording; a larger one is less often in a class."""
 PAUSE = 30.0
 """Seconds between one recording and the next."""
 SEPARATIONS = 2
-"""Motions that are asked for in the three minutes, as `planner_node` asks (its parameter `separations`)."""
+"""Motions planned in the three minutes, as in `planner_node` (its parameter `separations`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class World:
         return Profile('round', tuple(builder.segments), ('outer', 'middle', 'inner'))
 
     def hidden(self) -> dict:
-        """Return what is hidden: effect -> value."""
+        """Return the hidden effect: name -> value."""
         empty = make_session(self.seed, noise=self.noise, profile=self.round())
         table = Table.from_mapping(empty.table)
         gatherer = MotionGatherer(table)
@@ -92,7 +92,7 @@ def appended(first: SampleBlock, second: SampleBlock) -> SampleBlock:
 
 
 def run(world: World) -> dict:
-    """Return one row: what was hidden, the class, the planned motion, what was named in the end."""
+    """Return one row: the hidden effect, the class, the planned motion, the final findings."""
     hidden, start = world.hidden(), time.process_time()
     first = world.session(0, world.round(), hidden)
     table = Table.from_mapping(first.table)
@@ -122,12 +122,12 @@ def run(world: World) -> dict:
 
 
 def is_class(found: list) -> bool:
-    """Return whether a finding has others that would do as well."""
+    """Return whether a finding has alternatives that fit as well."""
     return any(mates for _, mates in found)
 
 
 def judged(found: list, hidden: str, done: Sequence[Plan]) -> dict:
-    """Return what plans promised and whether a single, right name is left, or a class that the first plan called one cause."""
+    """Return the predictions of the plans, and whether the finding is the hidden effect alone, or a class that the first plan reported as one cause."""
     missing = done[0].missing   # of all three minutes
     alike = {hidden, *(name for pair in missing for name in pair.split(' and ') if hidden in pair.split(' and '))}
     named = {name for effect, mates in found for name in (effect, *mates)}
@@ -147,7 +147,7 @@ def worlds(first_seed: int, effects: Sequence[str] = HIDDEN) -> Iterator[World]:
 
 
 def main() -> None:
-    """Go on until so many worlds were ambiguous, print a row for each."""
+    """Simulate worlds until the requested number is ambiguous; print a row for each."""
     parser = ArgumentParser(description=__doc__.split('\n', maxsplit=1)[0])
     parser.add_argument('--worlds', type=int, default=60, help='worlds in which the first recording leaves a class')
     parser.add_argument('--first-seed', type=int, default=0)

@@ -29,8 +29,8 @@ EXPLANATIONS = 4
 """Explanations of the lags that are tried, at most."""
 LEFT = 0.1
 """Largest remaining share of a significant excess after pairs, or effects of implausible size."""
-HOPELESS = 3 * LEFT
-"""The same before they are relinearised: a larger share is not tried, because each trial needs up to eight linearisations."""
+LEFT_BEFORE = 3 * LEFT
+"""The same before the choice is relinearised: a larger share is rejected at once, because a trial needs up to eight linearisations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +195,7 @@ def _with_lags(explanations, linearised_at):
 
 
 def _best_of(trials, linearised_at):
-    """Return the trial with the highest rank; only those that may have it are finished."""
+    """Return the finished trial with the highest rank; a trial is finished only if its rank exceeds that of the best."""
     best = None
     for trial in sorted(trials, key=lambda trial: trial.rank, reverse=True):
         if best is None or trial.rank > best.rank:
@@ -222,7 +222,7 @@ def _looked_again(outcome, linearised_at, any_size, tried):
     lags = _resolved(problem, outcome.chosen)
     found = [search.run([*lags, *start]) for start in ((), *best_pairs(search))]
     best = min(found, key=search.cost)
-    if _labels(best) in tried or outcome.explained.rest(best) >= HOPELESS * outcome.rest or \
+    if _labels(best) in tried or outcome.explained.rest(best) >= LEFT_BEFORE * outcome.rest or \
             (not any_size and search.cost(best) >= search.cost(outcome.chosen)):
         return outcome
     tried.add(_labels(best))

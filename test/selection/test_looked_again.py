@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from imu_calibration.selection import investigation
-from imu_calibration.selection.investigation import HOPELESS, LEFT
+from imu_calibration.selection.investigation import LEFT, LEFT_BEFORE
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_a_choice_that_removes_nearly_all_is_adopted(looked_again):
 
 
 def test_a_choice_that_leaves_much_is_not_linearised(looked_again):
-    assert looked_again(100.0 * HOPELESS, 0.0) == (100.0, 0)
+    assert looked_again(100.0 * LEFT_BEFORE, 0.0) == (100.0, 0)
 
 
 def test_a_choice_is_linearised_once(looked_again):
