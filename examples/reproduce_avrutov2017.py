@@ -4,11 +4,11 @@
 import itertools
 
 import numpy as np
+from papers import avrutov2017 as avrutov
+from papers import avrutov2017 as avrutov_budget
+from papers.linear_least_squares import condition_numbers, null_directions, numerical_rank
 
 from imu_calibration.core.errors import NotObservableError
-from imu_calibration.papers import avrutov2017 as avrutov
-from imu_calibration.papers import avrutov2017 as avrutov_budget
-from imu_calibration.papers.linear_least_squares import condition_numbers, null_directions, numerical_rank
 
 ANGLES = avrutov.equal_angles()
 TILT = np.deg2rad(2 / 60)

@@ -2,13 +2,9 @@
 """Rerun Zhang et al., "Comprehensive Calibration of Strap-Down Tri-Axis Accelerometer Unit" (Sensors 2017), and compare the results with the published claims."""
 
 import numpy as np
-
-from imu_calibration.core.errors import NotObservableError
-from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.kinematics import strapdown
-from imu_calibration.papers import zhang2017 as zhang
-from imu_calibration.papers import zhang2017 as zhang_claims
-from imu_calibration.papers.zhang2017_joint_fit import (
+from papers import zhang2017 as zhang
+from papers import zhang2017 as zhang_claims
+from papers.zhang2017_joint_fit import (
     DESIGNS,
     arm_errors,
     design_runs,
@@ -24,6 +20,11 @@ from imu_calibration.papers.zhang2017_joint_fit import (
     stack_runs,
     weak_arms,
 )
+
+from imu_calibration.core.errors import NotObservableError
+from imu_calibration.core.units import STANDARD_GRAVITY
+from imu_calibration.kinematics import strapdown
+from imu_calibration.report.calibration_sections import axis_readings
 
 G = STANDARD_GRAVITY
 MG = 1e-3 * G
@@ -79,7 +80,7 @@ def print_tables_2_and_4(rng):
     for title, printed, rate in (('Table 2, at rest', zhang.TABLE_2_G, 0.0), ('Table 4, spinning at 100 deg/s', zhang.TABLE_4_G, 100.0)):
         heading(f'{title}: printed, before -> after (error ratio) | ours, simulated from Tables 1 and 3')
         before, after, reference = simulated_readings(rng, rate)
-        for line in zhang.axis_readings(before, after, reference, rate=np.deg2rad([rate, rate]), gravity=G):
+        for line in axis_readings(before, after, reference, rate=np.deg2rad([rate, rate]), gravity=G):
             sensor, column = 'xyz'.index(line.sensor), 0 if line.position == '+x' else 2
             shown = printed[sensor, column:column + 2]
             ratio = abs(shown[0] - line.theoretical_g) / abs(shown[1] - line.theoretical_g)

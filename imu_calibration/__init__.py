@@ -46,7 +46,6 @@ From the lowest layer; each package imports only packages above it in this list.
 `core`            samples, units, settings, errors, documents, probabilities
 `kinematics`      table and joints become attitude, rate, angular acceleration, specific force; strapdown integration
 `effects`         the catalogue of physical effects, and the sensor model made of it
-`papers`          Avrutov 2017 and Zhang 2017 as printed, with errata
 `preprocessing`   a stream becomes windows: static poses, spins, dynamic stretches; checks of a recording
 `estimation`      windows become a solution: noise, likelihood, least squares, observability
 `simulation`      the model run: profiles of motion, noise, sessions

@@ -1,5 +1,6 @@
 """The page of a calibration, and its sections with figures: observability, error budget, readings at rest."""
 
+from dataclasses import dataclass
 from itertools import compress
 from typing import Any
 
@@ -13,7 +14,6 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import harmed
 from imu_calibration.document.trust import usage
 from imu_calibration.effects.base import PREFIXES, SENSORS, UNITS
-from imu_calibration.papers.zhang2017 import AxisReading, axis_readings
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.figures import AFTER, AXIS_COLOURS, GREY, INK, MARKER, STATUS, Drawn, axis_legend, draw, lever_figure, log_axis
 from imu_calibration.report.navigation_section import navigation_section
@@ -154,6 +154,73 @@ def _dots(figure, result, budget):
 
 LEVEL_FORCE_SHARE = 0.02
 """Windows with a mean specific force further than this share from 1 g turn through the vertical and have no reading at 1 g."""
+
+
+WITHIN_DEG, STILL_DEG_S = 5.0, 0.2
+"""Windows within this angle of a sensor axis are used; slower windows are at rest, faster ones are grouped by rate rounded to 1 deg/s."""
+
+
+@dataclass(frozen=True)
+class AxisReading:
+    """One line of Zhang's Table 2 (at rest) or Table 4 (in rotation)."""
+
+    position: str
+    """Sensor axis that points up or down, '+x' to '-z'."""
+    rate_deg_s: float
+    """Turn rate, deg/s; 0 at rest."""
+    n_windows: int
+    """Windows averaged in this line."""
+    sensor: str
+    """Sensor whose reading this is, 'x', 'y' or 'z'."""
+    theoretical_g: float
+    """Reading of a perfect sensor, g."""
+    before_g: float
+    """Reading before compensation, g."""
+    after_g: float
+    """Reading after compensation, g."""
+
+    @property
+    def improvement(self) -> float:
+        """Return the error before over the error after, in sizes."""
+        after = abs(self.after_g - self.theoretical_g)
+        return abs(self.before_g - self.theoretical_g) / after if after > 0 else np.inf
+
+
+def axis_readings(measured: np.ndarray, compensated: np.ndarray, reference: np.ndarray, *, rate: np.ndarray,
+                  gravity: float) -> list[AxisReading]:
+    """
+    Return readings at +-1 g, at rest and in rotation, before and after compensation, as lines of Zhang's Tables 2 and 4.
+
+    Parameters
+    ----------
+    measured, compensated, reference : arrays, shape (n, 3)
+        Window means of specific force: raw, corrected, and of a perfect sensor at the reference point, m/s^2.
+    rate : array, shape (n,)
+        Turn rate of the table in each window, rad/s.
+    gravity : float
+        Local gravity, m/s^2: the g of the lines.
+
+    Returns
+    -------
+    list of AxisReading
+        At rest first, then by rate; three lines per position; empty when no window fits.
+
+    """
+    measured, compensated, reference = (np.asarray(a, float).reshape(-1, 3) / gravity for a in (measured, compensated, reference))
+    rate_deg_s = np.abs(np.rad2deg(np.asarray(rate, float)))
+    rate_deg_s = np.where(rate_deg_s < STILL_DEG_S, 0.0, np.maximum(np.round(rate_deg_s), 1.0))
+    size = np.linalg.norm(reference, axis=1)
+    axis = np.argmax(np.abs(reference), axis=1)
+    along = np.take_along_axis(reference, axis[:, None], axis=1)[:, 0] if len(reference) else size
+    near = np.abs(along) >= np.cos(np.deg2rad(WITHIN_DEG)) * size
+    lines = []
+    for key in sorted({(r, -int(np.sign(s)), int(a)) for r, s, a in zip(rate_deg_s[near], along[near], axis[near])}):
+        chosen = near & (rate_deg_s == key[0]) & (np.sign(along) == -key[1]) & (axis == key[2])
+        position = ('+' if key[1] < 0 else '-') + 'xyz'[key[2]]
+        means = [np.mean(values[chosen], axis=0) for values in (reference, measured, compensated)]
+        lines += [AxisReading(position, float(key[0]), int(np.sum(chosen)), sensor, *(float(mean[i]) for mean in means))
+                  for i, sensor in enumerate('xyz')]
+    return lines
 
 
 def reading_tables(result: CalibrationResult, errors: WindowErrors) -> list[list[AxisReading]]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from papers import zhang2017 as zhang
 
 from imu_calibration.calibration.diagnosis.sentences import sentence
 from imu_calibration.calibration.installation_angles import AXIS_PAIRS, angles_of, derive, in_paper_units, split
@@ -12,7 +13,6 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED
-from imu_calibration.papers import zhang2017 as zhang
 from imu_calibration.report.page import people
 
 MODEL = SensorModel()

@@ -2,11 +2,7 @@
 
 import numpy as np
 import pytest
-from refusal import refused
-
-from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.estimation.observability import tolerance_scaled_singular_values
-from imu_calibration.papers.linear_least_squares import (
+from papers.linear_least_squares import (
     condition_numbers,
     null_directions,
     numerical_rank,
@@ -14,6 +10,10 @@ from imu_calibration.papers.linear_least_squares import (
     solve_linear,
     tolerance_scaled,
 )
+from refusal import refused
+
+from imu_calibration.core.errors import InputError, NotObservableError
+from imu_calibration.estimation.observability import tolerance_scaled_singular_values
 
 NAMES = ('bias', 'slope', 'curve')
 

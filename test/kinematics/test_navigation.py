@@ -2,6 +2,10 @@
 
 import numpy as np
 import pytest
+from papers import zhang2017 as zhang
+from papers import zhang2017 as zhang_claims
+from papers import zhang2017_joint_fit as zhang_designs
+from papers import zhang2017_joint_fit as zhang_joint
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
@@ -9,10 +13,6 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.kinematics import strapdown
 from imu_calibration.kinematics.rotations import Reference
-from imu_calibration.papers import zhang2017 as zhang
-from imu_calibration.papers import zhang2017 as zhang_claims
-from imu_calibration.papers import zhang2017_joint_fit as zhang_designs
-from imu_calibration.papers import zhang2017_joint_fit as zhang_joint
 
 from worlds.figures import show
 

@@ -2,18 +2,18 @@
 
 import numpy as np
 import pytest
-from refusal import refused
-
-from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.papers import avrutov2017 as avrutov
-from imu_calibration.papers import avrutov2017 as avrutov_budget
-from imu_calibration.papers.linear_least_squares import (
+from papers import avrutov2017 as avrutov
+from papers import avrutov2017 as avrutov_budget
+from papers.linear_least_squares import (
     condition_numbers,
     null_directions,
     numerical_rank,
     predicted_sd,
     tolerance_scaled,
 )
+from refusal import refused
+
+from imu_calibration.core.errors import InputError, NotObservableError
 
 from worlds.figures import show
 

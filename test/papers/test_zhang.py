@@ -4,12 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from refusal import refused
-
-from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.papers import zhang2017 as zhang
-from imu_calibration.papers.zhang2017_joint_fit import (
+from papers import zhang2017 as zhang
+from papers.zhang2017_joint_fit import (
     DESIGNS,
     PARAM_NAMES,
     average_headings,
@@ -27,6 +23,10 @@ from imu_calibration.papers.zhang2017_joint_fit import (
     two_axis,
     weak_arms,
 )
+from refusal import refused
+
+from imu_calibration.core.errors import InputError, NotObservableError
+from imu_calibration.core.units import STANDARD_GRAVITY
 
 from worlds.figures import show
 
@@ -342,27 +342,3 @@ def test_sign_of_table_3_against_tables_2_and_4():
     show('', 'shift of y and z, mg; arm, mm', [*shift[1:], *(1e3 * arm)], '-2.53 -2.59; 8.14 8.32')
     np.testing.assert_allclose(1e3 * arm, [8.14, 8.32], atol=0.02)
     assert np.all(np.sign(arm) == np.sign(np.diag(ARMS)[1:]))
-
-
-def test_axis_readings_reproduce_the_layout_of_tables_2_and_4():
-    force = G * zhang.six_positions()
-    spinning = np.tile([G, 0, 0], (2, 1))
-    oblique = G * np.array([[0.7, 0.7, 0.14]])
-    reference = np.vstack([force, spinning, oblique])
-    rate = np.concatenate([np.zeros(6), np.deg2rad([99.9, 100.1]), [0.0]])
-    bias = MG * np.array([1.0, -2.0, 3.0])
-    lines = zhang.axis_readings(reference + bias, reference + 0.1 * bias, reference, rate=rate, gravity=G)
-    assert [line.position for line in lines[::3]] == ['+x', '+y', '+z', '-x', '-y', '-z', '+x']
-    assert [line.rate_deg_s for line in lines[::3]] == [0] * 6 + [100] and lines[-1].n_windows == 2
-    for line in lines:
-        i = 'xyz'.index(line.sensor)
-        assert line.before_g - line.theoretical_g == pytest.approx(bias[i] / G, abs=1e-12)
-        assert line.improvement == pytest.approx(10)
-        assert line.theoretical_g == pytest.approx({'+': 1, '-': -1}[line.position[0]] if line.position[1] == line.sensor else 0, abs=1e-12)
-
-
-def test_axis_readings_of_a_recording_without_such_positions_are_empty():
-    oblique = G * np.array([[0.7, 0.7, 0.14]])
-    assert zhang.axis_readings(oblique, oblique, oblique, rate=[0.0], gravity=G) == []
-    nothing = np.zeros((0, 3))
-    assert zhang.axis_readings(nothing, nothing, nothing, rate=np.zeros(0), gravity=G) == []

@@ -265,7 +265,7 @@ def test_scripts_import_names_that_the_package_has(folder):
     def known(module, name):
         return hasattr(found := import_module(module), name) or hasattr(found, '__path__') and find_spec(f'{module}.{name}') is not None
     lacking = []
-    for path in sorted((ROOT / folder).glob('*.py')):
+    for path in sorted((ROOT / folder).rglob('*.py')):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or '').split('.')[0] in ('imu_calibration', 'msg_adapters'):
                 lacking += [f'{path.name}: {node.module}.{alias.name}' for alias in node.names if not known(node.module, alias.name)]

@@ -10,7 +10,7 @@ from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.kinematics import strapdown
 from imu_calibration.kinematics.rotations import lever_matrix
-from imu_calibration.papers.linear_least_squares import LinearSolution, solve_linear
+from papers.linear_least_squares import LinearSolution, solve_linear
 
 TABLE_1_ANGLES_DEG = np.array([[0.75997, 90.71425, 89.74038], [89.25516, 0.74486, 90.5630], [90.52202, 89.17706, 0.97456]])
 """Installation angles as printed, row i: sensor axis i to body x, y, z."""
@@ -153,73 +153,6 @@ def average_rates(arms: np.ndarray, rates: np.ndarray, weighted: bool = True) ->
     """Average closed-form arms of several spin rates, shape (n_rates, 3, 3), with weights rate^4 (their inverse variances) or plainly."""
     rates = np.asarray(rates, float)
     return np.average(arms, axis=0, weights=rates**4 if weighted else None)
-
-
-WITHIN_DEG, STILL_DEG_S = 5.0, 0.2
-"""Windows within this angle of a sensor axis are used; slower windows are at rest, faster ones are grouped by rate rounded to 1 deg/s."""
-
-
-@dataclass(frozen=True)
-class AxisReading:
-    """One line of Zhang's Table 2 (at rest) or Table 4 (in rotation)."""
-
-    position: str
-    """Sensor axis that points up or down, '+x' to '-z'."""
-    rate_deg_s: float
-    """Turn rate, deg/s; 0 at rest."""
-    n_windows: int
-    """Windows averaged in this line."""
-    sensor: str
-    """Sensor whose reading this is, 'x', 'y' or 'z'."""
-    theoretical_g: float
-    """Reading of a perfect sensor, g."""
-    before_g: float
-    """Reading before compensation, g."""
-    after_g: float
-    """Reading after compensation, g."""
-
-    @property
-    def improvement(self) -> float:
-        """Return the error before over the error after, in sizes."""
-        after = abs(self.after_g - self.theoretical_g)
-        return abs(self.before_g - self.theoretical_g) / after if after > 0 else np.inf
-
-
-def axis_readings(measured: np.ndarray, compensated: np.ndarray, reference: np.ndarray, *, rate: np.ndarray,
-                  gravity: float) -> list[AxisReading]:
-    """
-    Return readings at +-1 g, at rest and in rotation, before and after compensation, as lines of Zhang's Tables 2 and 4.
-
-    Parameters
-    ----------
-    measured, compensated, reference : arrays, shape (n, 3)
-        Window means of specific force: raw, corrected, and of a perfect sensor at the reference point, m/s^2.
-    rate : array, shape (n,)
-        Turn rate of the table in each window, rad/s.
-    gravity : float
-        Local gravity, m/s^2: the g of the lines.
-
-    Returns
-    -------
-    list of AxisReading
-        At rest first, then by rate; three lines per position; empty when no window fits.
-
-    """
-    measured, compensated, reference = (np.asarray(a, float).reshape(-1, 3) / gravity for a in (measured, compensated, reference))
-    rate_deg_s = np.abs(np.rad2deg(np.asarray(rate, float)))
-    rate_deg_s = np.where(rate_deg_s < STILL_DEG_S, 0.0, np.maximum(np.round(rate_deg_s), 1.0))
-    size = np.linalg.norm(reference, axis=1)
-    axis = np.argmax(np.abs(reference), axis=1)
-    along = np.take_along_axis(reference, axis[:, None], axis=1)[:, 0] if len(reference) else size
-    near = np.abs(along) >= np.cos(np.deg2rad(WITHIN_DEG)) * size
-    lines = []
-    for key in sorted({(r, -int(np.sign(s)), int(a)) for r, s, a in zip(rate_deg_s[near], along[near], axis[near])}):
-        chosen = near & (rate_deg_s == key[0]) & (np.sign(along) == -key[1]) & (axis == key[2])
-        position = ('+' if key[1] < 0 else '-') + 'xyz'[key[2]]
-        means = [np.mean(values[chosen], axis=0) for values in (reference, measured, compensated)]
-        lines += [AxisReading(position, float(key[0]), int(np.sum(chosen)), sensor, *(float(mean[i]) for mean in means))
-                  for i, sensor in enumerate('xyz')]
-    return lines
 
 
 def static_navigation(model: StaticModel, drift_sd_g: float, rng: np.random.Generator, *, n_draws: int = 400, seconds: float = 50.0,

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.kinematics.rotations import lever_matrix
-from imu_calibration.papers.linear_least_squares import RANK_TOLERANCE, ToleranceScaled, solve_linear, tolerance_scaled
+from papers.linear_least_squares import RANK_TOLERANCE, ToleranceScaled, solve_linear, tolerance_scaled
 
 DESIGNS = ('Z0', 'Z60', 'O', 'M')
 """Zhang's own runs, the same with the fixture skewed by 60 deg, oscillations, and a mixture with two-axis turns."""

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.papers.linear_least_squares import LinearSolution, solve_linear
+from papers.linear_least_squares import LinearSolution, solve_linear
 
 MODEL_COLUMNS = {
     'linear': ('bias', 'x', 'y', 'z'),
