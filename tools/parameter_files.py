@@ -5,7 +5,7 @@ from pathlib import Path
 
 from imu_calibration.core.settings import describe
 from imu_calibration.nodes import NODE_NAMES
-from imu_calibration.nodes.parameters import meaning, settings_of, value_text
+from imu_calibration.nodes.lifecycle import meaning, settings_of, value_text
 
 
 def main(folder: Path = Path(__file__).resolve().parents[1] / 'config') -> None:

@@ -2,8 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import BAG
-from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
+from imu_calibration.cli.parser import BAG, OneLineParser, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 
 EXAMPLES = ('session --imu-topic /imu_a/data_raw --imu-topic /imu_b/data_raw',

@@ -2,8 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli import arguments
-from imu_calibration.cli.parser import OneLineParser, VerbResult, hints_of
+from imu_calibration.cli.parser import BAG, OneLineParser, VerbResult, add_session_arguments, choices_of, hints_of, require_place, stand_of
 
 EXAMPLES = ('session --table table.yaml --output result', 'by_hand_session --gravity 9.81 --output result')
 
@@ -11,16 +10,12 @@ EXAMPLES = ('session --table table.yaml --output result', 'by_hand_session --gra
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     common, expert = parser.common.add_argument, parser.expert.add_argument
-    parser.add_argument('bags', nargs='+', metavar='BAG', help=arguments.BAG)
+    parser.add_argument('bags', nargs='+', metavar='BAG', help=BAG)
     common('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
-    arguments.add_gravity_arguments(parser)
     expert('--earlier', metavar='FILE', help='earlier calibration.yaml to compare (table only)')
     common('--no-report', action='store_true', help='write calibration.yaml only')
     expert('--jobs', type=int, help='recordings read at a time, default one per core')
-    arguments.add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
-    arguments.add_topic_arguments(parser)
-    arguments.add_result_arguments(parser)
-    arguments.add_model_arguments(parser)
+    add_session_arguments(parser)
 
 
 def run(options: Namespace) -> VerbResult:
@@ -29,10 +24,10 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.document import files
     from imu_calibration.document.calibration_text import to_mapping
     from imu_calibration.use_cases.calibrate import calibrate
-    arguments.require_place(options, 'calibrate', options.bags)
+    require_place(options, 'calibrate', options.bags)
     with files.output_folder(options.output) as folder:
-        choices = arguments.choices_of(options)
-        found = calibrate(options.bags, arguments.stand_of(options), jobs=options.jobs, earlier=options.earlier, **choices)
+        choices = choices_of(options)
+        found = calibrate(options.bags, stand_of(options), jobs=options.jobs, earlier=options.earlier, **choices)
         warn(found.calibration.statistics['preflight'])
         found.save(folder, report=not options.no_report)
         show_calibration(found, folder, hints_of(options), report=not options.no_report)

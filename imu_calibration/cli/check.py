@@ -2,8 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import BAG, add_stand_arguments, add_topic_arguments, choices_of, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import BAG, OneLineParser, VerbResult, add_recording_arguments, choices_of, stand_of
 
 EXAMPLES = ('later_session --calibration result/calibration.yaml --table table.yaml',
             'by_hand_session --calibration result/calibration.yaml --json')
@@ -14,8 +13,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common = parser.common.add_argument
     parser.add_argument('bag', metavar='BAG', help=f'a recording of the calibrated IMU: {BAG}')
     common('--calibration', metavar='FILE', required=True, help='calibration.yaml')
-    add_stand_arguments(parser, 'without it: by hand')
-    add_topic_arguments(parser)
+    add_recording_arguments(parser, 'without it: by hand')
 
 
 def run(options: Namespace) -> VerbResult:

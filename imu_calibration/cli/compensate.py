@@ -2,8 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import BAG, add_topic_arguments, named_as
-from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
+from imu_calibration.cli.parser import BAG, OneLineParser, VerbResult, add_topic_arguments, named_as, print_line
 
 EXAMPLES = ('drive --calibration result/calibration.yaml --output drive_corrected',
             'drive --calibration calibration.yaml --target-frame base_link --target-xyz 0.1 0 0.2 --output drive_corrected')

@@ -2,8 +2,16 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli import arguments
-from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
+from imu_calibration.cli.parser import (
+    BAG,
+    OneLineParser,
+    VerbResult,
+    add_session_arguments,
+    choices_of,
+    print_line,
+    require_place,
+    stand_of,
+)
 
 EXAMPLES = ('session --table table.yaml --output finding', 'by_hand_session --output finding')
 
@@ -11,14 +19,10 @@ EXAMPLES = ('session --table table.yaml --output finding', 'by_hand_session --ou
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     common = parser.common.add_argument
-    parser.add_argument('bag', metavar='BAG', help=arguments.BAG)
+    parser.add_argument('bag', metavar='BAG', help=BAG)
     common('--output', metavar='DIR', required=True, help='folder for diagnosis.json, calibration.yaml and report.html')
     common('--mcap', metavar='FILE', help='also write measured and simulated signals and the residuals as MCAP for Foxglove')
-    arguments.add_gravity_arguments(parser)
-    arguments.add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
-    arguments.add_topic_arguments(parser)
-    arguments.add_result_arguments(parser)
-    arguments.add_model_arguments(parser, searched=False)
+    add_session_arguments(parser, searched=False)
 
 
 def run(options: Namespace) -> VerbResult:
@@ -29,9 +33,9 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.use_cases.view import foxglove
     if options.mcap:
         foxglove()   # before the work, not after it
-    arguments.require_place(options, 'diagnose', [options.bag])
+    require_place(options, 'diagnose', [options.bag])
     with files.output_folder(options.output) as folder:
-        found = diagnose(options.bag, arguments.stand_of(options), **arguments.choices_of(options))
+        found = diagnose(options.bag, stand_of(options), **choices_of(options))
         warn(found.calibration.statistics['preflight'])
         found.save(folder)
         if options.mcap:

@@ -2,8 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_effects_argument
-from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
+from imu_calibration.cli.parser import OneLineParser, VerbResult, add_effects_argument, print_line
 
 EXAMPLES = ('', '--effects my_effects.yaml --json')
 

@@ -2,8 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_stand_arguments, add_topic_arguments, named_as, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
+from imu_calibration.cli.parser import OneLineParser, VerbResult, add_recording_arguments, named_as, print_line, stand_of
 from imu_calibration.core.errors import InputError
 
 EXAMPLES = ('--list', 'result/calibration.yaml --to kalibr --noise noise/noise.yaml --output imu.yaml')
@@ -20,8 +19,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--output', metavar='FILE', help='the file to write')
     expert('--bag', metavar='BAG', help='recording on which the loss is measured; default: a standard motion')
     expert('--anyway', action='store_true', help='also write a sensor with the decision harms; without it nominal values')
-    add_stand_arguments(parser, 'motion of --bag; without it: from its readings')
-    add_topic_arguments(parser)
+    add_recording_arguments(parser, 'motion of --bag; without it: from its readings')
 
 
 def run(options: Namespace) -> VerbResult:

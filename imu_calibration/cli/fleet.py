@@ -2,8 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, VerbResult, add_model_arguments, add_recording_arguments, choices_of
 
 EXAMPLES = ('units --table table.yaml --output fleet', 'units --table table.yaml --jobs 4 --no-report --output fleet')
 
@@ -17,8 +16,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--jobs', type=int, help='units calibrated side by side, default one per processor')
     common('--scheduler', metavar='ADDRESS', help='address of a dask scheduler (needs the extra dask)')
     common('--no-report', action='store_true', help='no report.html per unit')
-    add_stand_arguments(parser, 'a table or robot is required, the same for all units')
-    add_topic_arguments(parser)
+    add_recording_arguments(parser, 'a table or robot is required, the same for all units')
     add_model_arguments(parser)
 
 

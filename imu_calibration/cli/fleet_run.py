@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from imu_calibration.calibration.fleet import FleetStep, Spread, Unit, UnitResult, summarise
-from imu_calibration.cli.arguments import choices_of, stand_of
-from imu_calibration.cli.parser import VerbResult, hints_of
+from imu_calibration.cli.parser import VerbResult, choices_of, hints_of, stand_of
 from imu_calibration.cli.show import show_table, warn
 from imu_calibration.cli.terminal import Terminal
 from imu_calibration.core.errors import InputError, with_hint
@@ -23,10 +22,8 @@ from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.calibration_sections import calibration_report
 from imu_calibration.report.page import render
-from imu_calibration.use_cases.choices import topics_of
-from imu_calibration.use_cases.provenance import provenance_with
-from imu_calibration.use_cases.recordings import Topics, cluster_mapper, jobs_for, process_mapper, provenance_of, source_of
-from imu_calibration.use_cases.stand import table_of
+from imu_calibration.use_cases.choices import provenance_with, topics_of
+from imu_calibration.use_cases.recordings import Topics, cluster_mapper, jobs_for, process_mapper, provenance_of, source_of, table_of
 from msg_adapters.storages import suffixes
 
 

@@ -2,8 +2,7 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import named_as
-from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
+from imu_calibration.cli.parser import OneLineParser, VerbResult, named_as, print_line
 
 EXAMPLES = ('imu.yaml --from kalibr --output calibration.yaml', 'params.txt --from px4 --output calibration.yaml')
 

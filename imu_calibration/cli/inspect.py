@@ -3,8 +3,16 @@
 from argparse import Namespace
 from dataclasses import asdict
 
-from imu_calibration.cli.arguments import BAG, add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult, hints_of
+from imu_calibration.cli.parser import (
+    BAG,
+    OneLineParser,
+    VerbResult,
+    add_model_arguments,
+    add_recording_arguments,
+    choices_of,
+    hints_of,
+    stand_of,
+)
 from imu_calibration.core.errors import ImuCalibrationError, with_hint
 
 EXAMPLES = ('session', 'session --table table.yaml')
@@ -14,8 +22,7 @@ TOPICS = (('imu_topic', 'imu'), ('joint_topic', 'joints'), ('temperature_topic',
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG', help=BAG)
-    add_stand_arguments(parser, 'with it, axes and units are compared with the joints and the motions are listed')
-    add_topic_arguments(parser)
+    add_recording_arguments(parser, 'with it, axes and units are compared with the joints and the motions are listed')
     add_model_arguments(parser, searched=False)
 
 
@@ -26,8 +33,7 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.preprocessing.checks import refuse
     from imu_calibration.use_cases.choices import calibration_options, topics_of
     from imu_calibration.use_cases.inspect import imu_topics_of, inspect
-    from imu_calibration.use_cases.recordings import Topics, existing
-    from imu_calibration.use_cases.stand import table_of
+    from imu_calibration.use_cases.recordings import Topics, existing, table_of
     bag, choices, stand, hints = existing(options.bag), choices_of(options), stand_of(options), hints_of(options)
     topics = imu_topics_of(bag, topics_of(choices))
     table = None if stand is None else table_of(stand, [options.bag], Topics(topics[0].imu, frame=topics[0].frame))

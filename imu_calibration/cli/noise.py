@@ -3,8 +3,7 @@
 from argparse import Namespace
 from itertools import groupby
 
-from imu_calibration.cli.arguments import add_topic_arguments, named_as
-from imu_calibration.cli.parser import OneLineParser, VerbResult, complain, print_line
+from imu_calibration.cli.parser import OneLineParser, VerbResult, add_topic_arguments, complain, named_as, print_line
 
 EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
 

@@ -1,16 +1,24 @@
-"""Arguments of the offline tool: the verbs, options that every verb has, and refusals in one line."""
+"""Arguments of the offline tool: the verbs, options that all or several of them have, and refusals in one line."""
+
+from __future__ import annotations
 
 import argparse
 import sys
-from argparse import Namespace
-from collections.abc import Mapping
+from argparse import Namespace, _ArgumentGroup
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from inspect import signature
+from pathlib import Path
 from shutil import get_terminal_size
-from typing import Any, NamedTuple, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TextIO, cast
 
 import imu_calibration
 from imu_calibration.cli.terminal import wrapped
 from imu_calibration.core.errors import ERROR_KEYS, did_you_mean
+
+if TYPE_CHECKING:
+    from imu_calibration.use_cases.choices import Choices
+    from imu_calibration.use_cases.recordings import Stand
 
 VERBS = {
     'inspect': 'Topics, rates, gaps, stamps, suspicious units and axes, motions found, and the parameters that the recording determines.',
@@ -128,3 +136,93 @@ def _usage(action):
 def hints_of(options: Namespace) -> dict[str, str]:
     """Return {key of an error: option}, of the options that this verb has."""
     return {key: '--' + key.replace('_', '-') for key in ERROR_KEYS if key in vars(options)}
+
+
+BAG = 'rosbag2 folder, .db3, .mcap, ROS 1 .bag, text (.csv)'
+
+
+def add_topic_arguments(parser: OneLineParser, *, joints: bool = True) -> None:
+    """Add the options that choose topics."""
+    common, expert = parser.common.add_argument, parser.expert.add_argument
+    common('--imu-topic', metavar='TOPIC', help='default /imu/data_raw, else the only Imu topic')
+    expert('--frame-id', metavar='FRAME', help='frame_id of the Imu messages; for a topic with several')
+    if joints:
+        common('--joint-topic', metavar='TOPIC', help='default /joint_states, else the only JointState topic')
+    expert('--temperature-topic', metavar='TOPIC', help='default /imu/temperature, else the only one')
+
+
+def add_stand_arguments(parser: OneLineParser, without: str) -> None:
+    """Add the options of the table or arm that moves the IMU; `without` describes the case without them."""
+    common, expert = parser.common.add_argument, parser.expert.add_argument
+    common('--table', metavar='TABLE', help=f'description of the table (YAML); {without}')
+    common('--urdf', metavar='FILE', help='robot description in place of a table; --table adds up, gravity, mount, limits')
+    common('--imu-link', metavar='LINK', help='link with the IMU, default its frame_id; without --urdf: of /robot_description in the bag')
+    expert('--allow-xacro', action='store_true', help='expand a .xacro file; it is a program: only from authors you trust')
+    expert('--up', type=float, nargs=3, metavar=('X', 'Y', 'Z'), help='up in the root frame; default TABLE, /tf_static or z')
+
+
+def stand_of(options: Namespace) -> Stand | None:
+    """Return the table or arm of parsed arguments."""
+    if options.urdf is None and options.imu_link is None:
+        return options.table
+    from imu_calibration.use_cases.recordings import Arm
+    return Arm(options.urdf, options.imu_link, options.table, options.up, options.allow_xacro)
+
+
+def add_recording_arguments(parser: OneLineParser, without: str) -> None:
+    """Add the options of the table or arm and of the topics of a recording; `without` as for `add_stand_arguments`."""
+    add_stand_arguments(parser, without)
+    add_topic_arguments(parser)
+
+
+def add_session_arguments(parser: OneLineParser, *, searched: bool = True) -> None:
+    """Add the options of a calibration: local gravity, recording, labels of the result, and model (`add_model_arguments`)."""
+    common = parser.common.add_argument
+    common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
+    common('--latitude', metavar='DEG', type=float, help='gravity from the latitude (WGS 84)')
+    common('--height', metavar='M', type=float, help='and height above the ellipsoid, default 0 m')
+    add_recording_arguments(parser, 'without it: by hand, gravity is the reference')
+    common('--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml')
+    common('--operator', metavar='TEXT', help='name of the operator, likewise')
+    common('--force', action='store_true', help='overwrite the result of another verb or other inputs')
+    add_model_arguments(parser, searched=searched)
+
+
+def require_place(options: Namespace, verb: str, bags: Sequence[str]) -> None:
+    """Refuse an output folder with the result of another verb or of other inputs, except with --force."""
+    if not options.force and (Path(options.output) / 'calibration.yaml').exists():
+        from imu_calibration.use_cases.choices import provenance_with, require_same_inputs
+        require_same_inputs(options.output, provenance_with(verb, bags, choices_of(options), stand=stand_of(options)))
+
+
+def add_model_arguments(parser: OneLineParser, *, searched: bool = True) -> None:
+    """Add the options that choose the parameters to estimate; `searched`: and the option that omits the search for effects."""
+    group = parser.expert
+    expert = group.add_argument
+    expert('--accelerometer-model', metavar='MODEL', help='effects joined by +; default bias+matrix, and accel_size_effect if observable')
+    expert('--gyroscope-model', metavar='MODEL', help='likewise; default bias+matrix')
+    expert('--reference-model', metavar='MODEL', help="effects of table and clock, or 'none'; default table_tilt")
+    add_effects_argument(group)
+    expert('--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect')
+    expert('--nominal', metavar='FILE', help='offsets and scales of recordings in volts or counts')
+    expert('--noise', metavar='FILE', help='noise.yaml of this IMU: model of its biases (table only)')
+    expert('--setting', metavar='NAME=VALUE', action='append', default=[],
+           help='of the window detection; an unknown name lists all')
+    if searched:
+        expert('--model-as-asked', action='store_true', help='add no effect to the requested model')
+
+
+def add_effects_argument(group: _ArgumentGroup) -> None:
+    """Add the option of effects in addition to the catalogue."""
+    group.add_argument('--effects', dest='catalogue', metavar='FILE', help='YAML or calibration.yaml with additional effects')
+
+
+def named_as(function: Callable, options: Namespace) -> dict[str, Any]:
+    """Return the parsed arguments that have the names of parameters of a function."""
+    return {name: value for name, value in vars(options).items() if name in signature(function).parameters}
+
+
+def choices_of(options: Namespace) -> Choices:
+    """Return the choices of parsed arguments."""
+    from imu_calibration.use_cases.choices import Choices
+    return cast(Choices, {name: value for name, value in vars(options).items() if name in Choices.__annotations__})

@@ -2,8 +2,15 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, choices_of, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
+from imu_calibration.cli.parser import (
+    OneLineParser,
+    VerbResult,
+    add_effects_argument,
+    add_stand_arguments,
+    choices_of,
+    print_line,
+    stand_of,
+)
 from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers

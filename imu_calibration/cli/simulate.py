@@ -2,8 +2,16 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_effects_argument, add_stand_arguments, add_topic_arguments, choices_of, named_as, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
+from imu_calibration.cli.parser import (
+    OneLineParser,
+    VerbResult,
+    add_effects_argument,
+    add_recording_arguments,
+    choices_of,
+    named_as,
+    print_line,
+    stand_of,
+)
 from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
@@ -33,8 +41,7 @@ def add_arguments(parser: OneLineParser) -> None:
     expert('--stamp-jitter-us', metavar='US', type=float, default=0.0,
            help='standard deviation of the IMU stamps, microseconds, default none')
     expert('--temperature', action='store_true', help='publish a temperature that warms up from 25 C')
-    add_stand_arguments(parser, 'default a three-axis table')
-    add_topic_arguments(parser)
+    add_recording_arguments(parser, 'default a three-axis table')
     expert('--storage', choices=identifiers(), default='sqlite3', help='default sqlite3')
     expert('--compression', choices=('none', 'zstd', 'lz4'), default='none', help='of the chunks of an mcap, default none')
 

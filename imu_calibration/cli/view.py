@@ -2,8 +2,16 @@
 
 from argparse import Namespace
 
-from imu_calibration.cli.arguments import add_model_arguments, add_stand_arguments, add_topic_arguments, choices_of, stand_of
-from imu_calibration.cli.parser import OneLineParser, VerbResult, complain, print_line
+from imu_calibration.cli.parser import (
+    OneLineParser,
+    VerbResult,
+    add_model_arguments,
+    add_recording_arguments,
+    choices_of,
+    complain,
+    print_line,
+    stand_of,
+)
 
 EXAMPLES = ('session --table table.yaml --output session.mcap', 'result --output parameters.mcap')
 
@@ -15,8 +23,7 @@ def add_arguments(parser: OneLineParser) -> None:
                         'the parameters are shown')
     common('--output', metavar='FILE', required=True, help='the MCAP to write')
     common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
-    add_stand_arguments(parser, 'without it: by hand, gravity is the reference')
-    add_topic_arguments(parser)
+    add_recording_arguments(parser, 'without it: by hand, gravity is the reference')
     add_model_arguments(parser)
 
 

@@ -11,8 +11,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.nodes.inputs import latched_qos, output_qos
-from imu_calibration.nodes.lifecycle import announce, run_node
-from imu_calibration.nodes.parameters import declare_parameters
+from imu_calibration.nodes.lifecycle import announce, declare_parameters, run_node
 from imu_calibration.nodes.playback import PLAYBACK_DEPTH, Batch, Pace, Playback
 from msg_adapters.rosbag2 import Rosbag2
 

@@ -26,17 +26,14 @@ from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.nodes.calibration_status import CalibrationGuide, markers_of, statuses_of
-from imu_calibration.nodes.calibration_worker import CalibrationWorker
+from imu_calibration.nodes.calibration_worker import CalibrationWorker, LiveSession, SessionFiles
 from imu_calibration.nodes.diagnosis_thread import Listeners, give_arrays_own_pages
 from imu_calibration.nodes.diagnostics import LOG_ERROR, LOG_INFO, Complaints, DiagnosticsPublisher, say
 from imu_calibration.nodes.inputs import BatchInput, latched_qos, output_qos, watch_inputs
-from imu_calibration.nodes.lifecycle import announce, run_node
-from imu_calibration.nodes.parameters import HINTS, declare_parameters
+from imu_calibration.nodes.lifecycle import HINTS, announce, declare_parameters, run_node
 from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of, words_of
-from imu_calibration.nodes.session_files import LiveSession, SessionFiles
 from imu_calibration.preprocessing.window import WindowSettings
-from imu_calibration.use_cases.choices import calibration_options
-from imu_calibration.use_cases.provenance import provenance_with
+from imu_calibration.use_cases.choices import calibration_options, provenance_with
 from msg_adapters.layout import Packed
 from msg_adapters.live import LiveGatherer
 from msg_adapters.write import encode_imu

@@ -26,9 +26,8 @@ from imu_calibration.nodes.adoption import Adopted, Awaited, CompensatorSettings
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.diagnostics import LOG_ERROR, Complaints
 from imu_calibration.nodes.inputs import MatchedInput, latched_qos, output_qos, sent_ns, watch_inputs
-from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node
+from imu_calibration.nodes.lifecycle import HINTS, announce, declare_parameters, every, guarded, run_node
 from imu_calibration.nodes.message_compensation import LiveCompensation
-from imu_calibration.nodes.parameters import HINTS, declare_parameters
 from imu_calibration.nodes.robot_stand import StaticFrames
 
 LOOK_FOR_FILE = 1.0

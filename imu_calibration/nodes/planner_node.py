@@ -32,8 +32,7 @@ from imu_calibration.nodes.calibration_status import driven_markers
 from imu_calibration.nodes.diagnostics import ERROR, LOG_ERROR, LOG_INFO, OK, WARN, Complaints, DiagnosticsPublisher, make_status, say
 from imu_calibration.nodes.inputs import BatchInput, MatchedInput, latched_qos, watch_inputs
 from imu_calibration.nodes.joint_commands import COMMANDS, OtherDrivers, make_command
-from imu_calibration.nodes.lifecycle import announce, every, guarded, run_node
-from imu_calibration.nodes.parameters import HINTS, declare_parameters
+from imu_calibration.nodes.lifecycle import HINTS, announce, declare_parameters, every, guarded, run_node
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.planning.campaign import Campaign, CampaignSettings, Suspect, separator_of

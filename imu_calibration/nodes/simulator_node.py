@@ -27,8 +27,7 @@ from imu_calibration.kinematics.motion_limits import limits_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.diagnostics import OK, WARN, DiagnosticsPublisher, make_status
 from imu_calibration.nodes.inputs import latched_qos, output_qos
-from imu_calibration.nodes.lifecycle import announce, run_node
-from imu_calibration.nodes.parameters import HINTS, declare_parameters
+from imu_calibration.nodes.lifecycle import HINTS, announce, declare_parameters, run_node
 from imu_calibration.nodes.playback import PLAYBACK_DEPTH, Batch, Pace, Playback
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.simulation.profiles import make_profile

@@ -21,10 +21,8 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.verdict import judged
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
-from imu_calibration.use_cases.provenance import made_from, provenance_with
-from imu_calibration.use_cases.recordings import jobs_for, name_of, open_bag, process_mapper, provenance_of, source_of
-from imu_calibration.use_cases.stand import Stand, table_of
+from imu_calibration.use_cases.choices import Choices, inputs_of, made_from, provenance_with
+from imu_calibration.use_cases.recordings import Stand, jobs_for, name_of, process_mapper, provenance_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,21 +101,14 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
         When a recording cannot be used, or no parameter can be determined from it.
 
     """
-    check_names(choices)
-    options, topics = calibration_options(choices), topics_of(choices)
     given = {**choices, 'earlier': earlier}
     earlier = None if earlier is None else files.given_calibration(earlier)
     if earlier is not None and table is None:
         raise InputError('an earlier calibration must be compared on a table, none was given; give its description', key='table',
                          code='table_missing')
     recordings = [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
-    stand, table = table, None if table is None else table_of(table, recordings, topics, gravity=options.gravity)
-    joints = None if table is None else table.joint_names
-    for path in recordings:
-        if not isinstance(path, SampleBlock):
-            open_bag(path, topics, want_joints=joints is not None).close()
+    stand, (options, table, sources) = table, inputs_of(recordings, table, choices)
     jobs = jobs_for(jobs, len(recordings))
-    sources = [source_of(item, topics, joints) for item in recordings]
     with ThreadPoolExecutor(1) as hashing:   # reads the files during the calibration, not before it
         provenance = hashing.submit(provenance_with, 'calibrate', recordings, given, stand=stand)
         if table is None:
@@ -169,18 +160,13 @@ def check(recording: str | PathLike | SampleBlock, calibration: Calibration | st
         When the recording cannot be used, or is of an IMU that is not on the table.
 
     """
-    check_names(choices)
     calibration = files.given_calibration(calibration)
-    options, topics = calibration_options(choices), topics_of(choices)
+    options, table, sources = inputs_of([recording], table, choices)
     if table is None:
-        result = check_by_hand(source_of(recording, topics, want_joints=False), calibration, options)
-        return replace(result, notes=(*_gravity(options, calibration), *_notes(recording, calibration)))
-    if not isinstance(recording, SampleBlock):
-        open_bag(recording, topics, want_joints=True).close()
-    table = table_of(table, [recording], topics, gravity=options.gravity)
-    source = source_of(recording, topics, table.joint_names)
-    result = check_on_table([source], table, calibration, options=options, names=[name_of(recording)])
-    return replace(result, notes=_notes(recording, calibration))
+        result, notes = check_by_hand(sources[0], calibration, options), _gravity(options, calibration)
+    else:
+        result, notes = check_on_table(sources, table, calibration, options=options, names=[name_of(recording)]), ()
+    return replace(result, notes=(*notes, *_notes(recording, calibration)))
 
 
 def _gravity(options, calibration):

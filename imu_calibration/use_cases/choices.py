@@ -1,21 +1,25 @@
-"""Choices of the user by name, and the list of effects."""
+"""Choices of the user by name, the inputs that they select, the list of effects, and the provenance of a result."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from hashlib import sha256
 from os import PathLike
-from typing import Any, TypedDict
+from pathlib import Path
+from typing import Any, NamedTuple, TypedDict
 
 from imu_calibration.allan.figures import NoiseFigures
-from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import NominalScaling
+from imu_calibration.core.documents import to_text
+from imu_calibration.core.errors import ImuCalibrationError, InputError
+from imu_calibration.core.samples import NominalScaling, SampleBlock
 from imu_calibration.core.settings import override
 from imu_calibration.document import files
 from imu_calibration.document.calibration_text import checked_tolerances
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.estimation.observability import MOTIONS
 from imu_calibration.kinematics.rotations import local_gravity
+from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.use_cases.recordings import Topics
+from imu_calibration.use_cases.recordings import Arm, Source, Stand, Topics, open_bag, provenance_of, source_of, table_of
 from imu_calibration.use_cases.resources import config_file
 
 
@@ -60,12 +64,46 @@ class Choices(TypedDict, total=False):
     """Who recorded and calibrated, for the document."""
 
 
-def check_names(choices: Mapping[str, Any]) -> None:
-    """Refuse choices that there are not."""
+class Inputs(NamedTuple):
+    """What a use case on recordings works with."""
+
+    options: CalibrationOptions
+    """Of estimation and validation."""
+    table: Table | None
+    """The chain of joints; None: by hand."""
+    sources: list[Source]
+    """One for each recording."""
+
+
+def inputs_of(recordings: Sequence[str | PathLike | SampleBlock], stand: Stand | None, choices: Mapping[str, Any]) -> Inputs:
+    """
+    Return the inputs that the user has chosen; each recording can be opened.
+
+    Parameters
+    ----------
+    recordings : sequence
+        Bags, or samples in memory.
+    stand : path-like, Table or Arm, optional
+        The reference, see `table_of`; None: by hand.
+    choices : mapping
+        See `Choices`.
+
+    Raises
+    ------
+    InputError
+        When a choice does not exist, or a file cannot be used.
+
+    """
     strange = sorted(set(choices) - set(Choices.__annotations__))
     if strange:
         raise InputError(f'{", ".join(strange)} cannot be chosen; the choices are {", ".join(Choices.__annotations__)}',
                          code='choice_unknown')
+    options, topics = calibration_options(choices), topics_of(choices)
+    table = None if stand is None else table_of(stand, recordings, topics, gravity=options.gravity)
+    for path in recordings:
+        if not isinstance(path, SampleBlock):
+            open_bag(path, topics, want_joints=table is not None).close()
+    return Inputs(options, table, [source_of(item, topics, None if table is None else table.joint_names) for item in recordings])
 
 
 def topics_of(choices: Mapping[str, Any]) -> Topics:
@@ -156,3 +194,92 @@ def _equation(effect):
         return ''
     shown = ' + '.join(f'k{n} * ({text})' if ' ' in text else f'k{n} * {text}' for n, text in enumerate(columns[:MAX_SHOWN_COLUMNS], 1))
     return f'output_i += {shown}{f" + ... ({len(columns)} columns)" if len(columns) > MAX_SHOWN_COLUMNS else ""}'
+
+
+LABELS = ('serial', 'operator')
+"""Options that name the IMU and the person."""
+STANDS = ('table', 'urdf', 'site')
+"""Options with the files of the reference."""
+SHORT_HASH_DIGITS = 16
+"""Hexadecimal digits of the hashes that earlier versions wrote."""
+
+
+def provenance_with(verb: str, recordings: Iterable[str | PathLike | SampleBlock], choices: Choices | Mapping[str, Any], *,
+                    stand: Stand | None = None) -> dict[str, Any]:
+    """
+    Return the provenance of a result, without anything that changes from run to run.
+
+    Parameters
+    ----------
+    verb : str
+        Verb or node that computes the result.
+    recordings : iterable
+        Bags, or samples in memory.
+    choices : mapping
+        Options, see `Choices`; the file of tolerances is named also if it is the default.
+    stand : Stand, optional
+        Table or arm.
+
+    """
+    used = dict(choices) | (vars(stand) if isinstance(stand, Arm) else {'table': stand})
+    used['tolerances'] = used.get('tolerances') or config_file('tolerances.yaml')
+    if isinstance(setting := used.get('setting'), Mapping):
+        used['setting'] = [f'{name}={value}' for name, value in setting.items()]
+    options = {name: _named(used[name]) for name in sorted(used) if used[name] and name not in LABELS}
+    return {'verb': verb, **provenance_of(recordings, options), **{name: str(used[name]) for name in LABELS if used.get(name)}}
+
+
+def _named(option):
+    """Return name and hash of a file or of data in memory; other options unchanged."""
+    if isinstance(option, (str, PathLike)):
+        return {'name': Path(option).name, 'sha256': files.hash_of(option)} if Path(option).is_file() else str(option)
+    if isinstance(option, (bool, int, float)):
+        return option
+    if isinstance(option, Iterable) and not isinstance(option, Mapping):
+        return list(option)
+    mapping = option.to_mapping() if isinstance(option, Table) else option
+    known = {'sha256': sha256(to_text(dict(mapping)).encode()).hexdigest()} if isinstance(mapping, Mapping) else {}
+    return {'name': 'in memory', **known}
+
+
+def made_from(found: Mapping[str, Any]) -> set[str]:
+    """Return the hashes of the recordings of a provenance, as many digits as all versions write."""
+    return {str(bag.get('sha256'))[:SHORT_HASH_DIGITS] for bag in found.get('bags') or () if isinstance(bag, Mapping)}
+
+
+def require_same_inputs(folder: str | PathLike, found: Mapping[str, Any]) -> None:
+    """
+    Refuse to overwrite the calibration of another verb or of other inputs.
+
+    Parameters
+    ----------
+    folder : path-like
+        Output folder.
+    found : mapping
+        Provenance of the new result.
+
+    Raises
+    ------
+    InputError
+        If calibration.yaml in the folder differs in verb, recordings, table or robot description, or is none.
+
+    """
+    path = Path(folder) / 'calibration.yaml'
+    if not path.exists():
+        return
+    try:
+        before = files.read_mapping(path, 'calibration document').get('provenance')
+    except ImuCalibrationError:
+        before = None
+    before = before if isinstance(before, Mapping) else {}
+    parts = {'verb': before.get('verb', found['verb']) == found['verb'], 'recordings': made_from(before) == made_from(found),
+             'reference': _stands(before) == _stands(found)}
+    if not all(parts.values()):
+        raise InputError(f'a result must not replace that of other inputs, {path} differs in '
+                         f'{" and ".join(name for name, same in parts.items() if not same)}; choose another folder, or overwrite it',
+                         key='force', code='other_result')
+
+
+def _stands(found):
+    options = found.get('options')
+    return {name: options[name] for name in STANDS if name in options} if isinstance(options, Mapping) else {}

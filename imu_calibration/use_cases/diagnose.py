@@ -14,10 +14,8 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import Choices, calibration_options, check_names, topics_of
-from imu_calibration.use_cases.provenance import provenance_with
-from imu_calibration.use_cases.recordings import source_of
-from imu_calibration.use_cases.stand import Stand, table_of
+from imu_calibration.use_cases.choices import Choices, inputs_of, provenance_with
+from imu_calibration.use_cases.recordings import Stand
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +106,8 @@ def diagnose(recording: str | PathLike | SampleBlock, table: Stand | None = None
         When the recording cannot be used, or no parameter can be determined from it.
 
     """
-    check_names(choices)
-    options = calibration_options(choices)
-    topics = topics_of(choices)
-    provenance = provenance_with('diagnose', [recording], choices, stand=table)
-    table = None if table is None else table_of(table, [recording], topics, gravity=options.gravity)
-    source = source_of(recording, topics, None if table is None else table.joint_names)
+    stand, (options, table, (source,)) = table, inputs_of([recording], table, choices)
+    provenance = provenance_with('diagnose', [recording], choices, stand=stand)
     if table is None:
         return Diagnosed(diagnose_without_table(source, options, provenance))
     return Diagnosed(diagnose_recording(source, table, options, provenance=provenance))

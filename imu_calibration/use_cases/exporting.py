@@ -10,8 +10,7 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.exports.export import Export, export, find_target
 from imu_calibration.document.exports.loss import TrialMotion, import_file, motion_of, recorded_motion, temperature_at
 from imu_calibration.preprocessing.window_finder import session_truth
-from imu_calibration.use_cases.recordings import Topics, name_of, source_of, temperatures
-from imu_calibration.use_cases.stand import Stand, table_of
+from imu_calibration.use_cases.recordings import Stand, Topics, name_of, source_of, table_of, temperatures
 
 
 def export_calibration(calibration: str | PathLike | Calibration, to: str, *, output: str | PathLike | None = None,

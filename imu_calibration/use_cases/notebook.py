@@ -18,8 +18,8 @@ from imu_calibration.use_cases.calibrate import check as _check
 from imu_calibration.use_cases.choices import Choices
 from imu_calibration.use_cases.compensate import compensate as _compensate
 from imu_calibration.use_cases.diagnose import diagnose as _diagnose
+from imu_calibration.use_cases.recordings import Stand
 from imu_calibration.use_cases.simulate import simulate as _simulate
-from imu_calibration.use_cases.stand import Stand
 
 Arguments = ParamSpec('Arguments')
 Result = TypeVar('Result')

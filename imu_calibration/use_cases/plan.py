@@ -29,7 +29,7 @@ from imu_calibration.planning.planning_problem import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import calibration_options
-from imu_calibration.use_cases.stand import Stand, table_of
+from imu_calibration.use_cases.recordings import Stand, table_of
 
 ACCUMULATOR = '.npz'
 """Suffix of the accumulator that a live session saves with its calibration."""

@@ -1,11 +1,14 @@
-"""Recordings by path, and a pool of processes over them."""
+"""Recordings by path, the table or arm that carried the IMU, and a pool of processes."""
+
+from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from multiprocessing import resource_tracker
@@ -17,7 +20,9 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter
 from imu_calibration.core.samples import SampleBlock, TemperatureSamples
 from imu_calibration.document import files
-from msg_adapters.bag import Recording, open_recording
+from imu_calibration.kinematics.table import Table
+from imu_calibration.kinematics.urdf import root_of, table_from_urdf, up_of
+from msg_adapters.bag import Recording, description_in, frame_of, open_recording, static_transforms
 from msg_adapters.storage import read_ahead
 
 Source = Callable[[], Iterator[SampleBlock]]
@@ -204,3 +209,83 @@ def cluster_mapper(address: str, done: Callable[[Any], object] = lambda item: No
                 done(future.result())
             return [future.result() for future in futures]
     return mapped
+
+
+LIKELY_LINK = 'imu_link'
+"""The IMU's link where no recording names its frame."""
+DESCRIPTIONS = ('.urdf', '.xacro')
+"""Endings of files that describe robots."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A robot that carries the IMU; missing entries are read from a recording."""
+
+    urdf: str | PathLike | None = None
+    """Robot description (.urdf or .xacro); None: that on the topic /robot_description of the recording."""
+    imu_link: str | None = None
+    """Link that carries the IMU; None: the frame of its messages."""
+    site: str | PathLike | Mapping[str, Any] | None = None
+    """Entries of a table description other than the joints: file or mapping; its joints may give limits by name."""
+    up: Sequence[float] | None = None
+    """Up in the frame of the root; None: from the site, otherwise from /tf_static of the recording, otherwise z."""
+    allow_xacro: bool = False
+    """Whether a .xacro file may be expanded, which runs its expressions as Python code."""
+
+
+Stand = str | PathLike | Table | Arm
+"""A table description or a robot description (file), a table, or an arm."""
+
+
+def table_of(stand: Stand, recordings: Sequence[str | PathLike | SampleBlock] = (), topics: Topics = Topics(), *,
+             gravity: float | None = None) -> Table:
+    """
+    Return the chain of joints of a table or an arm.
+
+    Parameters
+    ----------
+    stand : path-like, Table or Arm
+    recordings : sequence
+        The first one gives the IMU's frame, the attitude of a robot's root, and its description where no file is named.
+    topics : Topics
+        Topics of the recordings.
+    gravity : float, optional
+        Local gravity for a robot whose site does not give it, m/s^2.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be used, or required data are not in the recordings.
+
+    """
+    if isinstance(stand, Table):
+        return stand
+    if not isinstance(stand, Arm):
+        if Path(stand).suffix not in DESCRIPTIONS:
+            return files.read_table(stand)
+        stand = Arm(stand)
+    site = dict(stand.site or {}) if isinstance(stand.site, Mapping | None) else files.read_mapping(stand.site, 'table description')
+    bag = next(((str(existing(item)), topics.imu) for item in recordings if not isinstance(item, SampleBlock)), None)
+    text = _description(stand, bag)
+    if stand.up is not None:
+        site['up'] = list(stand.up)
+    elif bag is not None and site.get('up') is None:
+        site['up'] = list(up_of(root_of(text), static_transforms(*bag)))
+    if gravity is not None and site.get('gravity') is None:
+        site['gravity'] = gravity
+    return table_from_urdf(text, stand.imu_link or topics.frame or _frame(recordings, bag), site)
+
+
+def _description(arm, bag):
+    """Return the text of the robot description: of the file, otherwise of the recording's topic."""
+    if arm.urdf is not None:
+        return files.read_robot_description(arm.urdf, arm.allow_xacro)
+    if bag is None:
+        raise InputError('the description of the robot whose link was named must be given, got none; give the file', key='urdf')
+    return description_in(*bag)
+
+
+def _frame(recordings, bag):
+    if bag is not None:
+        return frame_of(*bag)
+    return next((item.imu.frame_id for item in recordings if isinstance(item, SampleBlock) and item.imu is not None), LIKELY_LINK)

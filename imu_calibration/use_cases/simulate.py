@@ -23,10 +23,9 @@ from imu_calibration.simulation.replay import replay as run_replay
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, hidden_effect, require_joints, true_imu
 from imu_calibration.simulation.session import simulate as run_session
-from imu_calibration.use_cases.choices import Choices, catalogue_of, check_names, topics_of
-from imu_calibration.use_cases.recordings import name_of, source_of
+from imu_calibration.use_cases.choices import Choices, catalogue_of, inputs_of
+from imu_calibration.use_cases.recordings import LIKELY_LINK, Arm, Stand, name_of, table_of
 from imu_calibration.use_cases.resources import config_file
-from imu_calibration.use_cases.stand import LIKELY_LINK, Arm, Stand, table_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,12 +138,11 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
         When the table is missing or is not that of the calibration, or no sample has a known motion.
 
     """
-    check_names(choices)
     if table is None:
         raise InputError('a replay needs the motion of the IMU, no table or arm was given; give one (by hand only the gyroscope '
                          'measures the turns)', key='table', code='replay_by_hand')
-    topics = topics_of(choices)
-    given = table_of(table, [recording], topics, gravity=choices.get('gravity'))
+    _, given, (source,) = inputs_of([recording], table, choices)
+    assert given is not None   # it is for a stand
     known = files.given_calibration(calibration)
     require_joints(known.model, given)
     noise = None
@@ -152,7 +150,7 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
         noise = {sensor: ReplayNoise(*known.noise(sensor), known.statistics[sensor].get('wander_time_s') or BIAS_TIME)
                  for sensor in SENSORS}
     report('simulating')
-    samples, lost = run_replay(source_of(recording, topics, given.joint_names)(), given, known.model, values=known.values, noise=noise,
+    samples, lost = run_replay(source(), given, known.model, values=known.values, noise=noise,
                                seed=seed)
     truth = replace(known, provenance={'simulated': {'seed': seed, 'replay': name_of(recording)}})
     stamps = cast(ImuSamples, samples.imu).stamp_ns

@@ -39,7 +39,7 @@ from imu_calibration.references.gravity.hand_options import HandOptions
 from imu_calibration.report.diagnosis_page import WHEN, histogram
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.choices import Choices
-from imu_calibration.use_cases.stand import Stand
+from imu_calibration.use_cases.recordings import Stand
 
 if TYPE_CHECKING:
     from imu_calibration.preprocessing.window import Window

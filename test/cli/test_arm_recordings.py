@@ -13,9 +13,8 @@ from imu_calibration.core.samples import ImuSamples, JointSamples
 from imu_calibration.document.files import read_calibration, read_robot_description
 from imu_calibration.kinematics.urdf import up_of
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.use_cases.recordings import Topics
+from imu_calibration.use_cases.recordings import Arm, Topics, table_of
 from imu_calibration.use_cases.simulate import simulate
-from imu_calibration.use_cases.stand import Arm, table_of
 from msg_adapters.bag import DESCRIPTION_TOPIC, STATIC_TOPIC
 from msg_adapters.write import write_session
 

@@ -19,7 +19,7 @@ from imu_calibration.core.errors import ERROR_KEYS, InputError, with_hint
 from imu_calibration.core.errors import REMEDY_VERBS as PROGRAMS
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.estimation.solution import COMMON_SCALE
-from imu_calibration.nodes.parameters import HINTS
+from imu_calibration.nodes.lifecycle import HINTS
 from imu_calibration.preprocessing.joint_checks import check_force
 from msg_adapters.write import write_session
 

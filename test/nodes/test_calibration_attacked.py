@@ -19,7 +19,7 @@ from sensor_msgs.msg import Imu, JointState  # noqa: E402
 from imu_calibration.nodes import calibration_node  # noqa: E402
 from imu_calibration.nodes.calibration_node import CalibrationNode  # noqa: E402
 from imu_calibration.nodes.calibration_status import advice_of  # noqa: E402
-from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
+from imu_calibration.nodes.lifecycle import unknown_parameters  # noqa: E402
 from imu_calibration.preprocessing.window import WindowSettings  # noqa: E402
 
 from ros.live_station import TABLE  # noqa: E402

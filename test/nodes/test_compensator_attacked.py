@@ -28,7 +28,7 @@ from imu_calibration.nodes import compensator_diagnostics, compensator_node, inp
 from imu_calibration.nodes.adoption import CompensatorSettings  # noqa: E402
 from imu_calibration.nodes.compensator_node import CompensatorNode  # noqa: E402
 from imu_calibration.nodes.inputs import latched_qos  # noqa: E402
-from imu_calibration.nodes.parameters import unknown_parameters  # noqa: E402
+from imu_calibration.nodes.lifecycle import unknown_parameters  # noqa: E402
 
 from ros.live_station import Station  # noqa: E402
 

@@ -8,7 +8,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 
 from imu_calibration.core.settings import describe  # noqa: E402
 from imu_calibration.nodes import NODE_NAMES  # noqa: E402
-from imu_calibration.nodes.parameters import settings_of  # noqa: E402
+from imu_calibration.nodes.lifecycle import settings_of  # noqa: E402
 from imu_calibration.planning.campaign import CampaignSettings  # noqa: E402
 from imu_calibration.planning.driver import DriverSettings  # noqa: E402
 

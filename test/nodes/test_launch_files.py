@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from imu_calibration.core.settings import describe
-from imu_calibration.nodes.parameters import settings_of
+from imu_calibration.nodes.lifecycle import settings_of
 
 ROOT = Path(__file__).resolve().parents[2]
 

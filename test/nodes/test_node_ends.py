@@ -13,7 +13,7 @@ from refusal import refused
 
 from imu_calibration.core.settings import describe
 from imu_calibration.nodes import is_node_process
-from imu_calibration.nodes.parameters import settings_of
+from imu_calibration.nodes.lifecycle import settings_of
 
 from ros.live_station import TABLE
 

@@ -10,7 +10,7 @@ import yaml
 
 from imu_calibration.core.settings import describe, setting
 from imu_calibration.nodes import NODE_NAMES
-from imu_calibration.nodes.parameters import settings_of, value_text
+from imu_calibration.nodes.lifecycle import settings_of, value_text
 from tools.parameter_files import main, rendered
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,7 +48,7 @@ def test_make_config_writes_what_is_missing_and_leaves_the_rest(tmp_path, capsys
 def test_a_new_setting_is_a_parameter_and_a_line_of_its_file(monkeypatch):
     """Nothing but the declaration is touched."""
     node_module = pytest.importorskip('imu_calibration.nodes.compensator_node')
-    from imu_calibration.nodes.parameters import declare_parameters
+    from imu_calibration.nodes.lifecycle import declare_parameters
 
     @dataclass(frozen=True)
     class Wider(node_module.CompensatorSettings):

@@ -10,7 +10,7 @@ import time
 import pytest
 
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.nodes.parameters import UNKNOWN_PARAMETER
+from imu_calibration.nodes.lifecycle import UNKNOWN_PARAMETER
 
 from worlds.compensation_cases import random_calibration
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from imu_calibration.document import files
-from imu_calibration.nodes.session_files import SessionFiles
+from imu_calibration.nodes.calibration_worker import SessionFiles
 
 
 def live(n_windows=7, saved=b'motion'):
@@ -21,7 +21,7 @@ def live(n_windows=7, saved=b'motion'):
 FULL_DISK = '''
 import sys
 from types import SimpleNamespace
-from imu_calibration.nodes.session_files import SessionFiles
+from imu_calibration.nodes.calibration_worker import SessionFiles
 
 def live(n_windows, size):
     return SimpleNamespace(n_windows=n_windows, saved=lambda pending: b'%d' % n_windows * size)

@@ -35,8 +35,8 @@ from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.plan import class_in
+from imu_calibration.use_cases.recordings import table_of
 from imu_calibration.use_cases.resources import config_file
-from imu_calibration.use_cases.stand import table_of
 from msg_adapters.joint_state import JOINT_TRAJECTORY_TYPE
 
 from worlds.arms import SEVEN_AXES
