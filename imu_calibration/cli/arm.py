@@ -1,8 +1,6 @@
 """``imu_calibration arm``: where one IMU sits relative to another on the same rigid body."""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import BAG, OneLineParser, VerbResult, print_line
+from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 
 EXAMPLES = ('session --imu-topic /imu_a/data_raw --imu-topic /imu_b/data_raw',
@@ -17,7 +15,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--frame-id', metavar='FRAME', action='append', default=[], help='frame_id of A, then of B; for a topic with several')
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Estimate and print."""
     from imu_calibration.between_imus.arm import estimate_arm
     from imu_calibration.calibration.hand_workflow import read_by_hand

@@ -1,8 +1,6 @@
 """``imu_calibration calibrate``: a recording becomes a calibration file and a report."""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import BAG, OneLineParser, VerbResult, add_session_arguments, choices_of, hints_of, require_place, stand_of
+from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult
 
 EXAMPLES = ('session --table table.yaml --output result', 'by_hand_session --gravity 9.81 --output result')
 
@@ -15,20 +13,20 @@ def add_arguments(parser: OneLineParser) -> None:
     expert('--earlier', metavar='FILE', help='earlier calibration.yaml to compare (table only)')
     common('--no-report', action='store_true', help='write calibration.yaml only')
     expert('--jobs', type=int, help='recordings read at a time, default one per core')
-    add_session_arguments(parser)
+    parser.add_session()
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Calibrate into a folder that can be written, print the verdict, return the exit code."""
     from imu_calibration.cli.show import show_calibration, warn
     from imu_calibration.document import files
     from imu_calibration.document.calibration_text import to_mapping
     from imu_calibration.use_cases.calibrate import calibrate
-    require_place(options, 'calibrate', options.bags)
+    options.require_place(options.bags)
     with files.output_folder(options.output) as folder:
-        choices = choices_of(options)
-        found = calibrate(options.bags, stand_of(options), jobs=options.jobs, earlier=options.earlier, **choices)
+        choices = options.choices()
+        found = calibrate(options.bags, options.stand(), jobs=options.jobs, earlier=options.earlier, **choices)
         warn(found.calibration.statistics['preflight'])
         found.save(folder, report=not options.no_report)
-        show_calibration(found, folder, hints_of(options), report=not options.no_report)
+        show_calibration(found, folder, options.hints(), report=not options.no_report)
         return VerbResult(found.exit_code, to_mapping(found.calibration))

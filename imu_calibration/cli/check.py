@@ -1,8 +1,6 @@
 """``imu_calibration check``: is a calibration still good on this recording?"""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import BAG, OneLineParser, VerbResult, add_recording_arguments, choices_of, stand_of
+from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult
 
 EXAMPLES = ('later_session --calibration result/calibration.yaml --table table.yaml',
             'by_hand_session --calibration result/calibration.yaml --json')
@@ -13,10 +11,10 @@ def add_arguments(parser: OneLineParser) -> None:
     common = parser.common.add_argument
     parser.add_argument('bag', metavar='BAG', help=f'a recording of the calibrated IMU: {BAG}')
     common('--calibration', metavar='FILE', required=True, help='calibration.yaml')
-    add_recording_arguments(parser, 'without it: by hand')
+    parser.add_recording('without it: by hand')
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Print the errors before and after with their interval and the decision; exit code 0 when it helps each sensor, otherwise 3."""
     from imu_calibration.cli.show import show_table, warn
     from imu_calibration.cli.terminal import Terminal
@@ -24,9 +22,9 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.document.decision import ratio_text
     from imu_calibration.preprocessing.checks import warnings
     from imu_calibration.use_cases.calibrate import check
-    found = check(options.bag, options.calibration, stand_of(options), **choices_of(options))
+    found = check(options.bag, options.calibration, options.stand(), **options.choices())
     warn([finding.to_mapping() for finding in warnings(found.findings)])
-    out, numbers = Terminal.standard(), ('seconds', 'before', 'after', 'after / before, 95 %')
+    out, numbers = Terminal.of(), ('seconds', 'before', 'after', 'after / before, 95 %')
     rows = []
     for sensor, entry in found.proof.items():
         for motion, part in (('all', entry), *entry['regimes'].items()):

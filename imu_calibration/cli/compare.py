@@ -1,9 +1,8 @@
 """``imu_calibration compare``: whether two calibrations agree."""
 
-from argparse import Namespace
 from dataclasses import asdict
 
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult
 
 EXAMPLES = ('result/calibration.yaml earlier/calibration.yaml', 'a.yaml b.yaml --json')
 
@@ -14,14 +13,14 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_argument('second', metavar='B.yaml')
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Compare and print."""
     from imu_calibration.cli.show import show_table
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.core.units import for_people, with_sd
     from imu_calibration.document import comparison, files
     result = comparison.compare(files.read_calibration(options.first), files.read_calibration(options.second))
-    out = Terminal.standard()
+    out = Terminal.of()
     numbers = ('A', 'B', 'B - A', 'combined sd', 'in sd')
     shown = []
     for row in result.rows:

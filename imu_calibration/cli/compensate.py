@@ -1,8 +1,6 @@
 """``imu_calibration compensate``: a bag with the corrected topic in addition to the original ones."""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import BAG, OneLineParser, VerbResult, add_topic_arguments, named_as, print_line
+from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult, print_line
 
 EXAMPLES = ('drive --calibration result/calibration.yaml --output drive_corrected',
             'drive --calibration calibration.yaml --target-frame base_link --target-xyz 0.1 0 0.2 --output drive_corrected')
@@ -24,13 +22,13 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--anyway', action='store_true', help='also correct a sensor with the decision harms')
     expert('--noise', metavar='FILE', help='noise.yaml of this IMU, for the covariances where the messages bring none')
     expert('--correct-stamps', action='store_true', help="move the stamps back by the calibration's time_offset")
-    add_topic_arguments(parser, joints=False)
+    parser.add_topics(joints=False)
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Compensate into a new bag, print warnings and losses, return the exit code."""
     from imu_calibration.use_cases.compensate import compensate
-    found = compensate(options.bag, **named_as(compensate, options))
+    found = compensate(options.bag, **options.named_as(compensate))
     for line in found.warnings:
         print_line(f'note: {line}')
     print_line(f'written: {options.output} with {options.corrected_topic} ({found.count} samples)')

@@ -1,9 +1,8 @@
 """``imu_calibration convert``: a text log as a bag."""
 
-from argparse import Namespace
 from dataclasses import asdict
 
-from imu_calibration.cli.parser import OneLineParser, VerbResult, print_line
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 from msg_adapters.storages import identifiers
 
 EXAMPLES = ('log.csv --output session', 'log.csv --columns time=t:ms force=ax,ay,az:g rate=gx,gy,gz:deg/s --output session')
@@ -20,7 +19,7 @@ def add_arguments(parser: OneLineParser) -> None:
     expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Read the log, print the columns used, write the bag."""
     from msg_adapters.csv_log import read_csv
     from msg_adapters.write import write_session

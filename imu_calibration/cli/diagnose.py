@@ -1,17 +1,6 @@
 """``imu_calibration diagnose``: the errors of the model, their causes, the extended model, and the measured gain."""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import (
-    BAG,
-    OneLineParser,
-    VerbResult,
-    add_session_arguments,
-    choices_of,
-    print_line,
-    require_place,
-    stand_of,
-)
+from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult, print_line
 
 EXAMPLES = ('session --table table.yaml --output finding', 'by_hand_session --output finding')
 
@@ -22,10 +11,10 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_argument('bag', metavar='BAG', help=BAG)
     common('--output', metavar='DIR', required=True, help='folder for diagnosis.json, calibration.yaml and report.html')
     common('--mcap', metavar='FILE', help='also write measured and simulated signals and the residuals as MCAP for Foxglove')
-    add_session_arguments(parser, searched=False)
+    parser.add_session(searched=False)
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Diagnose into a folder that can be written, print the findings, return the exit code."""
     from imu_calibration.cli.show import warn
     from imu_calibration.document import files
@@ -33,9 +22,9 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.use_cases.view import foxglove
     if options.mcap:
         foxglove()   # before the work, not after it
-    require_place(options, 'diagnose', [options.bag])
+    options.require_place([options.bag])
     with files.output_folder(options.output) as folder:
-        found = diagnose(options.bag, stand_of(options), **choices_of(options))
+        found = diagnose(options.bag, options.stand(), **options.choices())
         warn(found.calibration.statistics['preflight'])
         found.save(folder)
         if options.mcap:

@@ -1,18 +1,16 @@
 """``imu_calibration effects``: the catalogue."""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import OneLineParser, VerbResult, add_effects_argument, print_line
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 
 EXAMPLES = ('', '--effects my_effects.yaml --json')
 
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    add_effects_argument(parser.common)
+    parser.add_effects(parser.common)
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Print one paragraph per effect."""
     from imu_calibration.use_cases.choices import effect_rows
     rows = effect_rows(options.catalogue)

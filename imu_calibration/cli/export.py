@@ -1,8 +1,6 @@
 """``imu_calibration export``: a calibration as estimators and autopilots want it."""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import OneLineParser, VerbResult, add_recording_arguments, named_as, print_line, stand_of
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 
 EXAMPLES = ('--list', 'result/calibration.yaml --to kalibr --noise noise/noise.yaml --output imu.yaml')
@@ -19,22 +17,22 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--output', metavar='FILE', help='the file to write')
     expert('--bag', metavar='BAG', help='recording on which the loss is measured; default: a standard motion')
     expert('--anyway', action='store_true', help='also write a sensor with the decision harms; without it nominal values')
-    add_recording_arguments(parser, 'motion of --bag; without it: from its readings')
+    parser.add_recording('motion of --bag; without it: from its readings')
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Show the list, or write the file and print the information that is lost."""
     if options.list:
         return VerbResult(0, {'targets': _show_targets()})
     for name, given in (('CALIBRATION', options.document), ('--to NAME', options.to), ('--output FILE', options.output)):
         if not given:
             raise InputError(f'an export must have {name}, none was given; give it, or see --list')
-    stand = stand_of(options)
+    stand = options.stand()
     if stand is not None and not options.bag:
         raise InputError('a table or arm needs the recording --bag BAG, none was given; give both')
     from imu_calibration.use_cases.choices import topics_of
     from imu_calibration.use_cases.exporting import export_calibration
-    found = export_calibration(options.document, stand=stand, topics=topics_of(vars(options)), **named_as(export_calibration, options))
+    found = export_calibration(options.document, stand=stand, topics=topics_of(vars(options)), **options.named_as(export_calibration))
     for line in (*found.lines, f'written: {options.output}'):
         print_line(line)
     return VerbResult(found.exit_code, {'output': options.output, 'lines': found.lines})
@@ -46,5 +44,5 @@ def _show_targets():
     from imu_calibration.document.exports.export import all_targets, holds_in_words
     rows = [(target.name, target.title, holds_in_words(target), target.noise_is or '-', 'yes' if target.read else '-')
             for target in all_targets().values() if target.write is not None]
-    show_table(Terminal.standard(), ('name', 'file', 'of the calibration it holds', 'noise', 'read'), rows)
+    show_table(Terminal.of(), ('name', 'file', 'of the calibration it holds', 'noise', 'read'), rows)
     return [dict(zip(('name', 'file', 'holds', 'noise', 'import'), row, strict=True)) for row in rows]

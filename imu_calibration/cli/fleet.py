@@ -1,8 +1,6 @@
 """``imu_calibration fleet``: many units, one result each, a summary table."""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import OneLineParser, VerbResult, add_model_arguments, add_recording_arguments, choices_of
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult
 
 EXAMPLES = ('units --table table.yaml --output fleet', 'units --table table.yaml --jobs 4 --no-report --output fleet')
 
@@ -16,12 +14,12 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--jobs', type=int, help='units calibrated side by side, default one per processor')
     common('--scheduler', metavar='ADDRESS', help='address of a dask scheduler (needs the extra dask)')
     common('--no-report', action='store_true', help='no report.html per unit')
-    add_recording_arguments(parser, 'a table or robot is required, the same for all units')
-    add_model_arguments(parser)
+    parser.add_recording('a table or robot is required, the same for all units')
+    parser.add_model()
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Calibrate all units, continuing past a bad bag."""
     from imu_calibration.cli.fleet_run import run_fleet
     from imu_calibration.use_cases.choices import calibration_options
-    return run_fleet(options, calibration_options(choices_of(options)))
+    return run_fleet(options, calibration_options(options.choices()))

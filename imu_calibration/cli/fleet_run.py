@@ -3,14 +3,13 @@
 import csv
 import io
 import math
-from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from imu_calibration.calibration.fleet import FleetStep, Spread, Unit, UnitResult, summarise
-from imu_calibration.cli.parser import VerbResult, choices_of, hints_of, stand_of
+from imu_calibration.cli.parser import Options, VerbResult
 from imu_calibration.cli.show import show_table, warn
 from imu_calibration.cli.terminal import Terminal
 from imu_calibration.core.errors import InputError, with_hint
@@ -80,12 +79,12 @@ CSV_KEYS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical
             'highest_unit')
 
 
-def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
+def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     """Calibrate every unit of a folder."""
     found = find_units(options.folder, options.output)
     table = _table(options, [path for _, paths in found for path in paths])
-    choices = choices_of(options)
-    used = provenance_with('fleet', (), choices, stand=stand_of(options))['options']
+    choices = options.choices()
+    used = provenance_with('fleet', (), choices, stand=options.stand())['options']
     units = [unit_of(name, paths, topics_of(choices), joint_names=table.joint_names, options=used) for name, paths in found]
     with files.output_folder(options.output) as folder:
         advance = counter('units', len(units))
@@ -99,14 +98,14 @@ def run_fleet(options: Namespace, settings: CalibrationOptions) -> VerbResult:
         rows = {'summary.csv': parameter_rows(spreads), 'units.csv': unit_rows(results)}
         files.write_texts(folder, {name: csv_text(table) for name, table in rows.items()} | {
             'summary.html': summary_html(results, spreads)})
-        show_fleet(results, spreads, folder, hints=hints_of(options))
+        show_fleet(results, spreads, folder, hints=options.hints())
     return VerbResult(3 if any(result.exit_code for result in results) else 0,
                       {'units': rows['units.csv'], 'parameters': rows['summary.csv']})
 
 
 def _table(options, bags):
     """Return the chain of joints; a description in recordings is read from the first readable one."""
-    stand, topics = stand_of(options), topics_of(choices_of(options))
+    stand, topics = options.stand(), topics_of(options.choices())
     if stand is None:
         raise InputError('a fleet is calibrated on a table or an arm, got none; describe it', key='table')
     for bag in bags[:-1]:
@@ -170,7 +169,7 @@ SPREAD_HEADINGS = ('parameter', 'mean', 'spread', 'typical sd', 'unit', 'spread 
 
 def show_fleet(results: Sequence[UnitResult], spreads: Sequence[Spread], folder: Path, *, hints: dict[str, str]) -> None:
     """Print the spread of each parameter, the units, and where the files are."""
-    out = Terminal.standard()
+    out = Terminal.of()
     show_table(out, SPREAD_HEADINGS, map(shown, spreads), numbers=[SPREAD_HEADINGS[k] for k in (1, 2, 3, 5)])
     for result in results:
         out.print(f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict_text}')

@@ -1,8 +1,6 @@
 """``imu_calibration import``: a calibration that another program made."""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import OneLineParser, VerbResult, named_as, print_line
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 
 EXAMPLES = ('imu.yaml --from kalibr --output calibration.yaml', 'params.txt --from px4 --output calibration.yaml')
 
@@ -16,11 +14,11 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--frame-id', metavar='FRAME', default='', help='frame_id of the Imu messages, where it shall be checked')
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Read, write, and list the parameters that the file lacks."""
     from imu_calibration.estimation.solution import HELD
     from imu_calibration.use_cases.exporting import import_calibration
-    found = import_calibration(options.file, **named_as(import_calibration, options))
+    found = import_calibration(options.file, **options.named_as(import_calibration))
     held = [name for name, status in found.requested.items() if status == HELD]
     for sensor, word in found.decisions.items():
         print_line(': '.join([f'{sensor} {word}', *filter(None, [found.decision_reasons.get(sensor)])]))

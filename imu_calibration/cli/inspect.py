@@ -1,18 +1,8 @@
 """``imu_calibration inspect``: topics of a recording, suspicious properties, and the parameters that it determines."""
 
-from argparse import Namespace
 from dataclasses import asdict
 
-from imu_calibration.cli.parser import (
-    BAG,
-    OneLineParser,
-    VerbResult,
-    add_model_arguments,
-    add_recording_arguments,
-    choices_of,
-    hints_of,
-    stand_of,
-)
+from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult
 from imu_calibration.core.errors import ImuCalibrationError, with_hint
 
 EXAMPLES = ('session', 'session --table table.yaml')
@@ -22,11 +12,11 @@ TOPICS = (('imu_topic', 'imu'), ('joint_topic', 'joints'), ('temperature_topic',
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG', help=BAG)
-    add_recording_arguments(parser, 'with it, axes and units are compared with the joints and the motions are listed')
-    add_model_arguments(parser, searched=False)
+    parser.add_recording('with it, axes and units are compared with the joints and the motions are listed')
+    parser.add_model(searched=False)
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Read each Imu topic and print its properties; with a table also the motions and the parameters that they determine."""
     from imu_calibration.cli.show import show_findings
     from imu_calibration.cli.terminal import Terminal
@@ -34,11 +24,11 @@ def run(options: Namespace) -> VerbResult:
     from imu_calibration.use_cases.choices import calibration_options, topics_of
     from imu_calibration.use_cases.inspect import imu_topics_of, inspect
     from imu_calibration.use_cases.recordings import Topics, existing, table_of
-    bag, choices, stand, hints = existing(options.bag), choices_of(options), stand_of(options), hints_of(options)
+    bag, choices, stand, hints = existing(options.bag), options.choices(), options.stand(), options.hints()
     topics = imu_topics_of(bag, topics_of(choices))
     table = None if stand is None else table_of(stand, [options.bag], Topics(topics[0].imu, frame=topics[0].frame))
     looks = inspect(bag, topics, table, options=calibration_options(choices))
-    out = Terminal.standard()
+    out = Terminal.of()
     _show_topics(out, looks)
     _show_unread(out, looks[0].recording, hints)
     codes = []

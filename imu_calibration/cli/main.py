@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: Namespace) -> int:
     """Run the verb that was parsed and print its document if --json is given; return the exit code."""
-    from imu_calibration.cli.parser import complain, hints_of
+    from imu_calibration.cli.parser import complain
     from imu_calibration.core.errors import ImuCalibrationError, printable
     from imu_calibration.core.progress import listening
     prog = f'imu_calibration {options.verb}'
@@ -127,7 +127,7 @@ def run(options: Namespace) -> int:
         return 1
     except (ImuCalibrationError, OSError, MemoryError, RecursionError) as error:
         if isinstance(error, ImuCalibrationError):
-            text, key, name = error.with_hint(hints_of(options)), error.key, error.code
+            text, key, name = error.with_hint(options.hints()), error.key, error.code
         else:
             text, key, name = printable(f'{type(error).__name__}: {error}; check disk space, memory, permissions and the input'), None, ''
         complain(f'{prog}: {text}')

@@ -1,9 +1,8 @@
 """``imu_calibration noise``: the noise of an IMU from a recording at rest."""
 
-from argparse import Namespace
 from itertools import groupby
 
-from imu_calibration.cli.parser import OneLineParser, VerbResult, add_topic_arguments, complain, named_as, print_line
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, complain, print_line
 
 EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
 
@@ -19,16 +18,16 @@ def add_arguments(parser: OneLineParser) -> None:
            help='averaging time at which a random walk replaces other slow noise, default 100 s')
     expert('--nominal', metavar='FILE', help='YAML with offsets and scales for recordings in volts or counts')
     common('--no-report', action='store_true', help='write noise.yaml only')
-    add_topic_arguments(parser, joints=False)
+    parser.add_topics(joints=False)
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Identify into a folder that can be written, print the figures, return the exit code."""
     from imu_calibration.allan.document import to_mapping
     from imu_calibration.document import files
     from imu_calibration.use_cases.noise import noise
     with files.output_folder(options.output) as folder:
-        found = noise(options.bag, **{name: value for name, value in named_as(noise, options).items() if value is not None})
+        found = noise(options.bag, **{name: value for name, value in options.named_as(noise).items() if value is not None})
         for warning in found.warnings:
             complain(f'warning: {warning}')
         found.save(folder, report=not options.no_report)

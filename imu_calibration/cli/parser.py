@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from argparse import Namespace, _ArgumentGroup
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
-from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TextIO, cast
 
 import imu_calibration
-from imu_calibration.cli.terminal import wrapped
+from imu_calibration.cli.terminal import Terminal, wrapped
 from imu_calibration.core.errors import ERROR_KEYS, did_you_mean
 
 if TYPE_CHECKING:
@@ -54,6 +52,9 @@ class VerbResult(NamedTuple):
     """The result as data, printed by --json."""
 
 
+BAG = 'rosbag2 folder, .db3, .mcap, ROS 1 .bag, text (.csv)'
+
+
 class OneLineParser(argparse.ArgumentParser):
     """Refuses with one line and exit code 1; options are in the groups `common` and `expert`."""
 
@@ -65,7 +66,7 @@ class OneLineParser(argparse.ArgumentParser):
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse; an unknown option is refused with the closest known one."""
-        options, extra = self.parse_known_args(args, namespace)
+        options, extra = self.parse_known_args(args, namespace or Options())
         if extra:
             known = getattr(options, 'verb_options', ())
             self.prog += f' {options.verb}'
@@ -77,6 +78,92 @@ class OneLineParser(argparse.ArgumentParser):
         complain(f"{self.prog}: {message}; see '{self.prog} --help'")
         raise SystemExit(1)
 
+    def add_topics(self, *, joints: bool = True) -> None:
+        """Add the options that choose topics."""
+        common, expert = self.common.add_argument, self.expert.add_argument
+        common('--imu-topic', metavar='TOPIC', help='default /imu/data_raw, else the only Imu topic')
+        expert('--frame-id', metavar='FRAME', help='frame_id of the Imu messages; for a topic with several')
+        if joints:
+            common('--joint-topic', metavar='TOPIC', help='default /joint_states, else the only JointState topic')
+        expert('--temperature-topic', metavar='TOPIC', help='default /imu/temperature, else the only one')
+
+    def add_stand(self, without: str) -> None:
+        """Add the options of the table or arm that moves the IMU; `without` describes the case without them."""
+        common, expert = self.common.add_argument, self.expert.add_argument
+        common('--table', metavar='TABLE', help=f'description of the table (YAML); {without}')
+        common('--urdf', metavar='FILE', help='robot description in place of a table; --table adds up, gravity, mount, limits')
+        common('--imu-link', metavar='LINK',
+               help='link with the IMU, default its frame_id; without --urdf: of /robot_description in the bag')
+        expert('--allow-xacro', action='store_true', help='expand a .xacro file; it is a program: only from authors you trust')
+        expert('--up', type=float, nargs=3, metavar=('X', 'Y', 'Z'), help='up in the root frame; default TABLE, /tf_static or z')
+
+    def add_recording(self, without: str) -> None:
+        """Add the options of the table or arm and of the topics of a recording; `without` as for `add_stand`."""
+        self.add_stand(without)
+        self.add_topics()
+
+    def add_session(self, *, searched: bool = True) -> None:
+        """Add the options of a calibration: local gravity, recording, labels of the result, and model (`add_model`)."""
+        common = self.common.add_argument
+        common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
+        common('--latitude', metavar='DEG', type=float, help='gravity from the latitude (WGS 84)')
+        common('--height', metavar='M', type=float, help='and height above the ellipsoid, default 0 m')
+        self.add_recording('without it: by hand, gravity is the reference')
+        common('--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml')
+        common('--operator', metavar='TEXT', help='name of the operator, likewise')
+        common('--force', action='store_true', help='overwrite the result of another verb or other inputs')
+        self.add_model(searched=searched)
+
+    def add_model(self, *, searched: bool = True) -> None:
+        """Add the options that choose the parameters to estimate; `searched`: and the option that omits the search for effects."""
+        expert = self.expert.add_argument
+        expert('--accelerometer-model', metavar='MODEL',
+               help='effects joined by +; default bias+matrix, and accel_size_effect if observable')
+        expert('--gyroscope-model', metavar='MODEL', help='likewise; default bias+matrix')
+        expert('--reference-model', metavar='MODEL', help="effects of table and clock, or 'none'; default table_tilt")
+        self.add_effects(self.expert)
+        expert('--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect')
+        expert('--nominal', metavar='FILE', help='offsets and scales of recordings in volts or counts')
+        expert('--noise', metavar='FILE', help='noise.yaml of this IMU: model of its biases (table only)')
+        expert('--setting', metavar='NAME=VALUE', action='append', default=[],
+               help='of the window detection; an unknown name lists all')
+        if searched:
+            expert('--model-as-asked', action='store_true', help='add no effect to the requested model')
+
+    def add_effects(self, group: argparse._ArgumentGroup) -> None:
+        """Add the option of effects in addition to the catalogue."""
+        group.add_argument('--effects', dest='catalogue', metavar='FILE', help='YAML or calibration.yaml with additional effects')
+
+
+class Options(argparse.Namespace):
+    """Parsed arguments of a verb."""
+
+    def stand(self) -> Stand | None:
+        """Return the table or arm, or None."""
+        if self.urdf is None and self.imu_link is None:
+            return self.table
+        from imu_calibration.use_cases.recordings import Arm
+        return Arm(self.urdf, self.imu_link, self.table, self.up, self.allow_xacro)
+
+    def choices(self) -> Choices:
+        """Return the choices for a use case."""
+        from imu_calibration.use_cases.choices import Choices
+        return cast(Choices, {name: value for name, value in vars(self).items() if name in Choices.__annotations__})
+
+    def hints(self) -> dict[str, str]:
+        """Return {key of an error: option}, of the options that this verb has."""
+        return {key: '--' + key.replace('_', '-') for key in ERROR_KEYS if key in vars(self)}
+
+    def require_place(self, bags: Sequence[str]) -> None:
+        """Refuse an output folder with the result of another verb or of other inputs, except with --force."""
+        if not self.force and (Path(self.output) / 'calibration.yaml').exists():
+            from imu_calibration.use_cases.choices import provenance_with, require_same_inputs
+            require_same_inputs(self.output, provenance_with(self.verb, bags, self.choices(), stand=self.stand()))
+
+    def named_as(self, function: Callable) -> dict[str, Any]:
+        """Return those that have the names of parameters of a function."""
+        return {name: value for name, value in vars(self).items() if name in signature(function).parameters}
+
 
 def complain(text: str) -> None:
     """Print a line on standard error (`print_line`)."""
@@ -85,14 +172,12 @@ def complain(text: str) -> None:
 
 def print_line(text: str, indent: str = '', *, stream: TextIO | None = None) -> None:
     """Print a line on `stream` (standard output), broken between words at the width of a terminal."""
-    print(folded(text, indent, stream=stream), file=stream or sys.stdout)
+    Terminal.of(stream).print(text, indent=indent)
 
 
-def folded(text: str, indent: str = '', last: str = '', *, stream: TextIO | None = None) -> str:
-    """Return a line for `stream` (standard output), broken between words at the width of a terminal; `last` ends each but the last part."""
-    if not (stream or sys.stdout).isatty():
-        return text
-    return f'{last}\n'.join(wrapped(text, get_terminal_size().columns - len(last), indent))
+def folded(text: str, indent: str = '', last: str = '') -> str:
+    """Return a line broken between words at the width of standard output; `last` ends each but the last part."""
+    return f'{last}\n'.join(wrapped(text, Terminal.of().width - len(last), indent))
 
 
 def make_parser(verb: str | None = None) -> OneLineParser:
@@ -131,98 +216,3 @@ def _usage(action):
     """Return a required argument as the usage line shows it."""
     name = action.metavar or action.dest.upper()
     return f'{action.option_strings[0]} {name}' if action.option_strings else f'{name} [{name} ...]' if action.nargs == '+' else name
-
-
-def hints_of(options: Namespace) -> dict[str, str]:
-    """Return {key of an error: option}, of the options that this verb has."""
-    return {key: '--' + key.replace('_', '-') for key in ERROR_KEYS if key in vars(options)}
-
-
-BAG = 'rosbag2 folder, .db3, .mcap, ROS 1 .bag, text (.csv)'
-
-
-def add_topic_arguments(parser: OneLineParser, *, joints: bool = True) -> None:
-    """Add the options that choose topics."""
-    common, expert = parser.common.add_argument, parser.expert.add_argument
-    common('--imu-topic', metavar='TOPIC', help='default /imu/data_raw, else the only Imu topic')
-    expert('--frame-id', metavar='FRAME', help='frame_id of the Imu messages; for a topic with several')
-    if joints:
-        common('--joint-topic', metavar='TOPIC', help='default /joint_states, else the only JointState topic')
-    expert('--temperature-topic', metavar='TOPIC', help='default /imu/temperature, else the only one')
-
-
-def add_stand_arguments(parser: OneLineParser, without: str) -> None:
-    """Add the options of the table or arm that moves the IMU; `without` describes the case without them."""
-    common, expert = parser.common.add_argument, parser.expert.add_argument
-    common('--table', metavar='TABLE', help=f'description of the table (YAML); {without}')
-    common('--urdf', metavar='FILE', help='robot description in place of a table; --table adds up, gravity, mount, limits')
-    common('--imu-link', metavar='LINK', help='link with the IMU, default its frame_id; without --urdf: of /robot_description in the bag')
-    expert('--allow-xacro', action='store_true', help='expand a .xacro file; it is a program: only from authors you trust')
-    expert('--up', type=float, nargs=3, metavar=('X', 'Y', 'Z'), help='up in the root frame; default TABLE, /tf_static or z')
-
-
-def stand_of(options: Namespace) -> Stand | None:
-    """Return the table or arm of parsed arguments."""
-    if options.urdf is None and options.imu_link is None:
-        return options.table
-    from imu_calibration.use_cases.recordings import Arm
-    return Arm(options.urdf, options.imu_link, options.table, options.up, options.allow_xacro)
-
-
-def add_recording_arguments(parser: OneLineParser, without: str) -> None:
-    """Add the options of the table or arm and of the topics of a recording; `without` as for `add_stand_arguments`."""
-    add_stand_arguments(parser, without)
-    add_topic_arguments(parser)
-
-
-def add_session_arguments(parser: OneLineParser, *, searched: bool = True) -> None:
-    """Add the options of a calibration: local gravity, recording, labels of the result, and model (`add_model_arguments`)."""
-    common = parser.common.add_argument
-    common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
-    common('--latitude', metavar='DEG', type=float, help='gravity from the latitude (WGS 84)')
-    common('--height', metavar='M', type=float, help='and height above the ellipsoid, default 0 m')
-    add_recording_arguments(parser, 'without it: by hand, gravity is the reference')
-    common('--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml')
-    common('--operator', metavar='TEXT', help='name of the operator, likewise')
-    common('--force', action='store_true', help='overwrite the result of another verb or other inputs')
-    add_model_arguments(parser, searched=searched)
-
-
-def require_place(options: Namespace, verb: str, bags: Sequence[str]) -> None:
-    """Refuse an output folder with the result of another verb or of other inputs, except with --force."""
-    if not options.force and (Path(options.output) / 'calibration.yaml').exists():
-        from imu_calibration.use_cases.choices import provenance_with, require_same_inputs
-        require_same_inputs(options.output, provenance_with(verb, bags, choices_of(options), stand=stand_of(options)))
-
-
-def add_model_arguments(parser: OneLineParser, *, searched: bool = True) -> None:
-    """Add the options that choose the parameters to estimate; `searched`: and the option that omits the search for effects."""
-    group = parser.expert
-    expert = group.add_argument
-    expert('--accelerometer-model', metavar='MODEL', help='effects joined by +; default bias+matrix, and accel_size_effect if observable')
-    expert('--gyroscope-model', metavar='MODEL', help='likewise; default bias+matrix')
-    expert('--reference-model', metavar='MODEL', help="effects of table and clock, or 'none'; default table_tilt")
-    add_effects_argument(group)
-    expert('--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect')
-    expert('--nominal', metavar='FILE', help='offsets and scales of recordings in volts or counts')
-    expert('--noise', metavar='FILE', help='noise.yaml of this IMU: model of its biases (table only)')
-    expert('--setting', metavar='NAME=VALUE', action='append', default=[],
-           help='of the window detection; an unknown name lists all')
-    if searched:
-        expert('--model-as-asked', action='store_true', help='add no effect to the requested model')
-
-
-def add_effects_argument(group: _ArgumentGroup) -> None:
-    """Add the option of effects in addition to the catalogue."""
-    group.add_argument('--effects', dest='catalogue', metavar='FILE', help='YAML or calibration.yaml with additional effects')
-
-
-def named_as(function: Callable, options: Namespace) -> dict[str, Any]:
-    """Return the parsed arguments that have the names of parameters of a function."""
-    return {name: value for name, value in vars(options).items() if name in signature(function).parameters}
-
-
-def choices_of(options: Namespace) -> Choices:
-    """Return the choices of parsed arguments."""
-    from imu_calibration.use_cases.choices import Choices
-    return cast(Choices, {name: value for name, value in vars(options).items() if name in Choices.__annotations__})

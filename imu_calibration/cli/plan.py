@@ -1,16 +1,6 @@
 """``imu_calibration plan``: the motions that bring every parameter within its tolerance."""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import (
-    OneLineParser,
-    VerbResult,
-    add_effects_argument,
-    add_stand_arguments,
-    choices_of,
-    print_line,
-    stand_of,
-)
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
@@ -24,7 +14,7 @@ def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     common, expert = parser.common.add_argument, parser.expert.add_argument
     common('--output', metavar='DIR', required=True, help='folder for plan.yaml, the trajectory and report.html')
-    add_stand_arguments(parser, 'with limits')
+    parser.add_stand('with limits')
     common('--by-hand', action='store_true', help='without a table: poses and turns in text and pictures')
     common('--calibration', '--known', metavar='FILE', help='known already: calibration.yaml or .accumulator.npz')
     common('--around', metavar='NAME=DEG,...', default='', help='pose that the motion keeps near, every joint (sliding: m)')
@@ -40,13 +30,13 @@ def add_arguments(parser: OneLineParser) -> None:
     expert('--accelerometer-model', metavar='MODEL', help='default size_effect')
     expert('--gyroscope-model', metavar='MODEL', help='default bias+matrix')
     expert('--reference-model', metavar='MODEL', help='default table_tilt')
-    add_effects_argument(parser.expert)
+    parser.add_effects(parser.expert)
     expert('--storage', choices=identifiers(), default='sqlite3', help='of the trajectory, default sqlite3')
     expert('--no-bound', action='store_true', help='no lower bound on the time (saves most of the run time)')
     expert('--no-report', action='store_true', help='no report.html')
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Plan into a folder that can be written, print the prediction, return the exit code."""
     from imu_calibration.document import files
     from imu_calibration.planning.planner import plan_to_mapping
@@ -54,11 +44,11 @@ def run(options: Namespace) -> VerbResult:
     stand = None if options.by_hand and options.motion == 'any' else _stand(options)
     with files.output_folder(options.output) as folder:
         if stand is None:
-            made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **choices_of(options))
+            made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **options.choices())
         else:
             made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate,
                         with_bound=not options.no_bound, separate=[name for name in options.separate.split(',') if name],
-                        diagnosis=options.diagnosis, around=_pose(options.around), reach=options.reach, **choices_of(options))
+                        diagnosis=options.diagnosis, around=_pose(options.around), reach=options.reach, **options.choices())
         made.save(folder, report=not options.no_report, storage=options.storage)
     _show(made, folder)
     return VerbResult(made.exit_code, plan_to_mapping(made.plan, made.provenance))
@@ -76,7 +66,7 @@ def _stand(options):
     from imu_calibration.planning.motion_library import yaw_table
     if options.motion == 'yaw-only':
         return yaw_table(options.gravity)
-    stand = stand_of(options)
+    stand = options.stand()
     if stand is None:
         raise InputError('a table or a robot description is required, none was given; give one', key='table')
     return stand

@@ -8,7 +8,7 @@ from types import MethodType
 from ros2cli.command import CommandExtension
 
 from imu_calibration.cli.main import run
-from imu_calibration.cli.parser import EXIT_CODES, OneLineParser, add_verbs
+from imu_calibration.cli.parser import EXIT_CODES, OneLineParser, Options, add_verbs
 
 
 class ImuCommand(CommandExtension):
@@ -27,4 +27,4 @@ class ImuCommand(CommandExtension):
         if getattr(args, 'verb', None) is None:
             self._parser.print_help()
             return 0
-        return run(args)
+        return run(Options(**vars(args)))

@@ -47,7 +47,7 @@ def show_findings(out: Terminal, findings: tuple[CheckFinding, ...], hints: dict
 
 def show_calibration(found: 'Calibrated', folder: Path, hints: dict[str, str], *, report: bool = True) -> None:
     """Print the parameters of a `Calibrated`, the decisions and where the files are."""
-    out = Terminal.standard()
+    out = Terminal.of()
     show_table(out, PARAMETER_HEADINGS, parameter_rows(found.calibration), numbers=NUMBER_COLUMNS)
     for line in summary(found.result, hints)[1]:
         out.print(line)

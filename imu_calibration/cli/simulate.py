@@ -1,17 +1,6 @@
 """``imu_calibration simulate``: a bag of a simulated session or of a replayed recording, with the true parameters."""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import (
-    OneLineParser,
-    VerbResult,
-    add_effects_argument,
-    add_recording_arguments,
-    choices_of,
-    named_as,
-    print_line,
-    stand_of,
-)
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 from imu_calibration.simulation.sensor_noise import GRADES
 from msg_adapters.storages import identifiers
@@ -29,7 +18,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--effect', metavar='NAME', action='append', default=[], help='add an effect of the catalogue; may be repeated')
     expert('--size', type=float, default=0.3,
            help='size of added effects as a share of the largest plausible one, default 0.3')
-    add_effects_argument(parser.expert)
+    parser.add_effects(parser.expert)
     common('--profile', metavar='NAME', default='calibration', help='motion, default calibration; an unknown name lists all')
     common('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
     common('--seed', type=int, default=0, help='seed of noise and motion, default 0')
@@ -41,21 +30,21 @@ def add_arguments(parser: OneLineParser) -> None:
     expert('--stamp-jitter-us', metavar='US', type=float, default=0.0,
            help='standard deviation of the IMU stamps, microseconds, default none')
     expert('--temperature', action='store_true', help='publish a temperature that warms up from 25 C')
-    add_recording_arguments(parser, 'default a three-axis table')
+    parser.add_recording('default a three-axis table')
     expert('--storage', choices=identifiers(), default='sqlite3', help='default sqlite3')
     expert('--compression', choices=('none', 'zstd', 'lz4'), default='none', help='of the chunks of an mcap, default none')
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Simulate and write."""
     from imu_calibration.use_cases.simulate import replay, simulate
     if options.replay is None:
-        made = simulate(**named_as(simulate, options) | {'effects': options.effect, 'table': stand_of(options)})
+        made = simulate(**options.named_as(simulate) | {'effects': options.effect, 'table': options.stand()})
     else:
         if options.calibration is None:
             raise InputError('--replay requires the IMU to simulate, no calibration was given; add --calibration FILE', key='calibration',
                              code='replay_without_calibration')
-        made = replay(options.replay, options.calibration, stand_of(options), seed=options.seed, **choices_of(options))
+        made = replay(options.replay, options.calibration, options.stand(), seed=options.seed, **options.choices())
     made.save(options.output, storage=options.storage, compression=options.compression)
     samples = made.samples
     print_line(f'written: {options.output} ({made.duration:.0f} s, {len(samples.imu or ())} Imu, '

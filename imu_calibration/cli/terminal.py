@@ -33,19 +33,20 @@ class Terminal:
     """Whether escape sequences of colours are written."""
 
     @classmethod
-    def standard(cls) -> 'Terminal':
-        """Return the terminal of standard output, with colours unless NO_COLOR is set (no-color.org)."""
-        moves = sys.stdout.isatty()
+    def of(cls, stream: TextIO | None = None) -> 'Terminal':
+        """Return the terminal of a stream (standard output), with colours unless NO_COLOR is set (no-color.org)."""
+        stream = stream or sys.stdout
+        moves = stream.isatty()
         coloured = moves and not os.environ.get('NO_COLOR') and os.environ.get('TERM') != 'dumb'
-        return cls(sys.stdout, shutil.get_terminal_size().columns if moves else UNLIMITED, moves, coloured)
+        return cls(stream, shutil.get_terminal_size().columns if moves else UNLIMITED, moves, coloured)
 
     def styled(self, text: str, style: str) -> str:
         """Return the text in a style of `CODES`; '' is plain."""
         return f'\x1b[{CODES[style]}m{text}\x1b[0m' if self.coloured and style and text else text
 
-    def print(self, text: str = '', style: str = '') -> None:
-        """Print the lines of a text."""
-        self.write(self.styled(part, style) for line in text.splitlines() or [''] for part in wrapped(line, self.width))
+    def print(self, text: str = '', style: str = '', indent: str | None = None) -> None:
+        """Print the lines of a text; `indent` as for `wrapped`."""
+        self.write(self.styled(part, style) for line in text.splitlines() or [''] for part in wrapped(line, self.width, indent))
 
     def write(self, lines: Iterable[str]) -> None:
         """Print lines as they are."""

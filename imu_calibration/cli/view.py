@@ -1,17 +1,6 @@
 """``imu_calibration view``: a recording's calibration as a picture that Foxglove opens."""
 
-from argparse import Namespace
-
-from imu_calibration.cli.parser import (
-    OneLineParser,
-    VerbResult,
-    add_model_arguments,
-    add_recording_arguments,
-    choices_of,
-    complain,
-    print_line,
-    stand_of,
-)
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, complain, print_line
 
 EXAMPLES = ('session --table table.yaml --output session.mcap', 'result --output parameters.mcap')
 
@@ -23,17 +12,17 @@ def add_arguments(parser: OneLineParser) -> None:
                         'the parameters are shown')
     common('--output', metavar='FILE', required=True, help='the MCAP to write')
     common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
-    add_recording_arguments(parser, 'without it: by hand, gravity is the reference')
-    add_model_arguments(parser)
+    parser.add_recording('without it: by hand, gravity is the reference')
+    parser.add_model()
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Write the file, print the layout to open it with and the missing parts; return the exit code."""
     from imu_calibration.use_cases.resources import config_file
     from imu_calibration.use_cases.view import foxglove, view
     foxglove()   # before the work, not after it
     layout = config_file('view.foxglove.json')
-    found = view(options.source, stand_of(options), **choices_of(options))
+    found = view(options.source, options.stand(), **options.choices())
     found.save(options.output)
     for line in found.lacks:
         complain(f'warning: {line}')

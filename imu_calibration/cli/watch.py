@@ -2,11 +2,10 @@
 
 import math
 import time
-from argparse import Namespace
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from imu_calibration.cli.parser import OneLineParser, VerbResult
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult
 from imu_calibration.cli.terminal import STYLES, Cell, Terminal
 from imu_calibration.core.errors import InputError, printable
 
@@ -24,7 +23,7 @@ def add_arguments(parser: OneLineParser) -> None:
     common('--once', action='store_true', help='show the present status and end')
 
 
-def run(options: Namespace) -> VerbResult:
+def run(options: Options) -> VerbResult:
     """Show the status of the node until it ends."""
     try:
         import rclpy
@@ -51,7 +50,7 @@ def _watch(watcher, options):
         others = f' (heard: {", ".join(sorted(watcher.others))})' if watcher.others else ''
         raise InputError(f"'{options.node}' must run, no message on /diagnostics in {options.patience:g} s; start it, or name it "
                          f'with --node, as `ros2 node list` shows it{others}')
-    out = Terminal.standard()
+    out = Terminal.of()
     if options.once or options.json:
         out.write(watcher.screen(out))
         return VerbResult(0, {'node': watcher.name, 'status': {name: asdict(status) for name, status in watcher.statuses.items()}})

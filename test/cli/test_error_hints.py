@@ -14,7 +14,7 @@ import pytest
 
 from imu_calibration.calibration.pose_scan import PoseScan, hand_status
 from imu_calibration.cli.main import main
-from imu_calibration.cli.parser import VERBS, hints_of, make_parser
+from imu_calibration.cli.parser import VERBS, make_parser
 from imu_calibration.core.errors import ERROR_KEYS, InputError, with_hint
 from imu_calibration.core.errors import REMEDY_VERBS as PROGRAMS
 from imu_calibration.core.samples import ImuSamples
@@ -92,7 +92,7 @@ def hints_and_options(verb):
     """The hints of a verb that got just what it requires, and the options that it has."""
     actions = make_parser(verb)._subparsers._group_actions[0].choices[verb]._actions
     given = [[*action.option_strings[:1], '1'] for action in actions if action.required]
-    return hints_of(make_parser(verb).parse_args([verb, *chain.from_iterable(given)])), {name for action in actions for name in action.option_strings}
+    return make_parser(verb).parse_args([verb, *chain.from_iterable(given)]).hints(), {name for action in actions for name in action.option_strings}
 
 
 @pytest.mark.parametrize('verb', VERBS)

@@ -35,7 +35,7 @@ def shown(monkeypatch, capsys, width, run):
     """Return the words that are printed on a terminal of a width; dotted names may break at a dot."""
     monkeypatch.setenv('COLUMNS', str(width))
     out = io.StringIO()
-    monkeypatch.setattr(Terminal, 'standard', classmethod(lambda cls: cls(out, width)))
+    monkeypatch.setattr(Terminal, 'of', classmethod(lambda cls, stream=None: cls(stream or out, width)))
     run()
     return (capsys.readouterr().out + out.getvalue()).replace('.', ' ').split()
 
@@ -46,7 +46,7 @@ def test_no_word_of_a_help_is_broken(verb, monkeypatch, capsys):
         with pytest.raises(SystemExit):
             main([verb, '--help'])
     wide, narrow = (shown(monkeypatch, capsys, width, run) for width in (400, 80))
-    assert set(narrow) <= set(wide)
+    assert set(narrow) - {'\\'} <= set(wide)   # a continued example ends with it
 
 
 @pytest.mark.long
