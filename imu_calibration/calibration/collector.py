@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -40,12 +41,13 @@ from imu_calibration.references.turntable.session_data import (
     owned_window,
 )
 
-SAVED_FORMAT = 'imu_calibration/accumulator/3'
+SAVED_FORMAT = 'imu_calibration/accumulator/4'
 SAVED_PARTS = ('accumulator', 'held_out', 'poses', 'counts', 'frame_id', 'first_stamp_ns', 'last_stamp_ns', 'largest_rate', 'largest_force',
                'temperature_c', 'judged_from')
 """Saved fields of a `SessionData`; windows with samples are not saved."""
+SAVED_PLAIN = (str, int, float, type(None))
 SAVED_TYPES: dict[str, Any] = {kind.__name__: kind for kind in (
-    dict, list, tuple, Counter, Accumulator, WindowBlock, WindowStatistics, SensorStatistics, HeldOut, HeldOutBlock, JointNames,
+    dict, tuple, Counter, Accumulator, WindowBlock, WindowStatistics, SensorStatistics, HeldOut, HeldOutBlock, JointNames,
     ModelChanges, ModelExtension)}
 """Types that an archive may contain, in addition to arrays and plain values."""
 
@@ -67,32 +69,62 @@ def to_bytes(gathered: SessionData, model: SensorModel, extension: ModelExtensio
     arrays: list[np.ndarray] = []
     of_model = {f.name: getattr(model, f.name) for f in fields(model) if f.name != 'catalogue'}
     content = ({name: getattr(gathered, name) for name in SAVED_PARTS}, of_model, model.definitions, replace(extension, clipped=None))
-    header = json.dumps({'format': SAVED_FORMAT, 'content': _packed(content, arrays)})
+    header = json.dumps({'format': SAVED_FORMAT, 'content': _packed([content], arrays)})
     target = io.BytesIO()
     np.savez(target, header=np.frombuffer(header.encode(), np.uint8), numbers=np.concatenate([np.zeros(0), *map(np.ravel, arrays)]))
     return target.getvalue()
 
 
-def _packed(value, arrays):
-    """Return a value as plain lists with the names of its types; its arrays are appended to `arrays`."""
-    if value is None or isinstance(value, (str, int, float)):
-        return value
+def _packed(values, arrays):
+    """Return a column of values as plain lists, one column per part of values of equal type; arrays of one shape are appended as one."""
+    if all(issubclass(kind, SAVED_PLAIN) for kind in set(map(type, values))):
+        return ['plain', values]
+    kinds = [_kind(value) for value in values]
+    if len(set(kinds)) > 1:
+        each = list(dict.fromkeys(kinds))
+        return ['mixed', [each.index(kind) for kind in kinds],
+                [_packed([value for value, own in zip(values, kinds) if own == kind], arrays) for kind in each]]
+    first = values[0]
+    if isinstance(first, np.ndarray):
+        arrays.append(np.array(values))
+        return ['array', arrays[-1].shape]
+    if isinstance(first, list):
+        return ['list', [len(value) for value in values], _packed([part for value in values for part in value], arrays)]
+    keys = tuple(first) if isinstance(first, dict) else ()
+    rows = values if isinstance(first, tuple) else [(value if isinstance(value, dict) else vars(value)).values() for value in values]
+    return [type(first).__name__, len(values), [_packed(column, arrays) for column in zip(*rows)], _packed(keys, arrays)]
+
+
+def _kind(value):
+    """Return the shape, the keys, the length or the type, which values of one column have in common."""
     if isinstance(value, np.ndarray):
-        arrays.append(value)
-        return ['array', value.shape]
-    parts = value.items() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else vars(value).values()
-    return [type(value).__name__, [_packed(part, arrays) for part in parts]]
+        return value.shape
+    if isinstance(value, dict):
+        return type(value), *value
+    if isinstance(value, tuple):
+        return len(value)
+    return None if isinstance(value, SAVED_PLAIN) else type(value)
 
 
-def _unpacked(value, numbers):
-    """Return the value that `_packed` wrote; its arrays are read from the beginning of the file `numbers`."""
-    if not isinstance(value, list):
-        return value
-    name, parts = value
+def _unpacked(column, numbers):
+    """Return the values that `_packed` wrote; their arrays are read from the beginning of the file `numbers`."""
+    name, size, *parts = column
+    if name == 'plain':
+        return size
     if name == 'array':
-        return np.frombuffer(numbers.read(8 * math.prod(parts))).reshape(parts)
-    parts, kind = [_unpacked(part, numbers) for part in parts], SAVED_TYPES[name]
-    return kind(*parts) if is_dataclass(kind) else kind(dict(parts) if issubclass(kind, dict) else parts)   # a Counter would count pairs
+        return list(np.frombuffer(numbers.read(8 * math.prod(size))).reshape(size))
+    if name == 'list':
+        items = iter(_unpacked(parts[0], numbers))
+        return [list(islice(items, length)) for length in size]
+    columns = [_unpacked(part, numbers) for part in parts[0]]
+    if name == 'mixed':
+        each = [iter(values) for values in columns]
+        return [next(each[number]) for number in size]
+    kind, rows = SAVED_TYPES[name], list(zip(*columns, strict=True)) or [()] * size
+    if is_dataclass(kind):
+        return [kind(*row) for row in rows]
+    keys = _unpacked(parts[1], numbers)
+    return [kind(dict(zip(keys, row)) if issubclass(kind, dict) else row) for row in rows]
 
 
 def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
@@ -111,7 +143,7 @@ def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
             if header.get('format') != SAVED_FORMAT:
                 raise DocumentError(f"an accumulator must have the format '{SAVED_FORMAT}', got "
                                     f"{shortened(repr(header.get('format')))}; remove the file")
-            parts, of_model, definitions, extension = _unpacked(header['content'], io.BytesIO(arrays['numbers'].tobytes()))
+            (parts, of_model, definitions, extension), = _unpacked(header['content'], io.BytesIO(arrays['numbers'].tobytes()))
             return SessionData(**parts), SensorModel(**of_model, catalogue=CATALOGUE.with_definitions(definitions)), extension
     except ImuCalibrationError:
         raise
@@ -183,7 +215,7 @@ class Collector:
         return used
 
     def _add(self, window):
-        reduced = reduce_window(window, self.model, self.table, session=self.session, with_pieces=True)
+        reduced = reduce_window(window, self.model, self.table, session=self.session)
         found = self.gathered
         found.take(reduced)
         found.largest_force = max(found.largest_force, float(np.max(np.abs(window.force_s))))

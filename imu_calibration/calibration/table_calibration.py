@@ -278,7 +278,7 @@ def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calib
         for raw, corrected in map(_both, (window for window in windows if window.kind != 'unused')):
             for held_out, window in ((before, raw), (after, corrected)):
                 if len(window) > 1:
-                    held_out.add(reduce_window(window, model, table, session=session, with_pieces=True))
+                    held_out.add(reduce_window(window, model, table, session=session))
     gathered = join(parts, names, lambda part: check_units(part, model, table))
     return CheckResult(prove_readings(before, after, model, reference=reference_values(model, calibration)), gathered.findings)
 
@@ -301,8 +301,5 @@ def _both(window):
     """Return a window with raw readings and the same with corrected ones, both without samples that cannot be corrected."""
     known = np.isfinite(window.corrected).all(axis=1)
     if not known.all():
-        motion = window.motion.select(known) if len(window.motion) == len(window) else window.motion
-        parts = {name: getattr(window, name)[known] for name in ('stamp_ns', 'time', 'force_s', 'rate_s', 'corrected')}
-        window = replace(window, motion=motion, **parts,
-                         temperature_c=None if window.temperature_c is None else window.temperature_c[known])
+        window = window.select(known)
     return window, replace(window, force_s=window.corrected[:, :3], rate_s=window.corrected[:, 3:])

@@ -22,7 +22,6 @@ from imu_calibration.effects.forward_equations import (
     coefficient_jacobian,
     coefficients,
     columns,
-    predict,
     sensor_output,
 )
 from imu_calibration.effects.sensor_model import SensorModel
@@ -35,8 +34,9 @@ from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.kinematics.chain import tilt
 from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window, joined_motion
+from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBlock
+from imu_calibration.selection.residual_blocks import residuals
 
 LEVELLING_SD = 2 * ARCMIN
 """Levelling of the table in each of two directions, rad; counts when table_tilt is not estimated."""
@@ -171,8 +171,7 @@ def _outputs(result, source, changes):
     found = {}
     for sensor in SENSORS:
         output, *moved = (sensor_output(model, sensor, result.solution.values, ref=each.at(sensor)) for each in references)
-        found[sensor] = columns(model, sensor, result.table, motion=source.motion, temperature_c=temperature, references=references[0]), \
-            np.array(moved).reshape(-1, *output.shape) - output
+        found[sensor] = columns(references[0], sensor), np.array(moved).reshape(-1, *output.shape) - output
     return found
 
 
@@ -219,10 +218,7 @@ class TableResult(CalibrationResult):
 
     def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
         """Return measured values minus those predicted from the motion of the table."""
-        motion, temperature_c = joined_motion([window])
-        predicted = predict(self.solution.model, self.solution.values, self.table, motion=motion, temperature_c=temperature_c)
-        return {sensor: measured - model for sensor, measured,
-                model in zip(SENSORS, (window.force_s, window.rate_s), predicted, strict=True)}
+        return residuals([window], self.table, self.solution.model, values=self.solution.values)
 
     def error_budget(self) -> ErrorBudget:
         """Return the contributions of the noise and of the table."""

@@ -90,33 +90,33 @@ class References:
         return _mean_reference(references, self.motion)
 
 
-def columns(model: SensorModel, sensor: str, table: Table, *, motion: JointMotion, temperature_c: np.ndarray | None = None,
-            references: References | None = None) -> np.ndarray:
+def columns(references: References, sensor: str) -> np.ndarray:
     """
-    Return the regressors of `sensor`, shape (n, n_columns), in the order of ``model.groups(sensor)``.
+    Return the regressors of `sensor` in the model of `references`, shape (n, n_columns), in the order of ``model.groups(sensor)``.
 
     A warp contributes, per parameter, the three components of the derivative of the true input (`force_s` or `rate_s`);
     its coefficients are matrix times parameter. The derivative is a difference of the exact kinematics.
     """
-    references = references or References(model, table, motion, temperature_c=temperature_c)
-    ref, layout, parts = references.at(sensor), model.layout(sensor), []
+    model, ref, parts = references.model, references.at(sensor), []
+    layout = model.layout(sensor)
     if ref.temperature_c is None and any('temperature' in group.uses for group in layout.groups.values()):
         raise InputError('a thermal effect needs temperatures, none were received; record imu/temperature or omit the effect')
     warps = {WARP + e.name: e for e in layout.effects if e.warp is not None}
     for name in layout.rows:
         if name in warps:
-            parts += _warp_columns(model, warps[name], sensor, references=references)
+            parts += _warp_columns(references, warps[name], sensor)
         elif name in layout.groups:
             parts.append(layout.groups[name].columns(ref, layout.point))
     return np.concatenate(parts, axis=1)
 
 
-def _warp_columns(model, effect, sensor, *, references):
+def _warp_columns(references, effect, sensor):
     """
     Return the columns of a warp: d(true input)/d(parameter), shape (n, 3 size), and d(lever matrix)/d(parameter) where arms are modelled.
 
     With `folded_arms` the true input is that at the sensitive points, and there is no second block.
     """
+    model = references.model
     if effect.derivative is not None:
         return [effect.derivative(references.at(sensor))]
     clock = model.find('reference', Role.DELAY)

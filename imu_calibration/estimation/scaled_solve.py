@@ -1,7 +1,6 @@
 """Triangular factors, and least squares with scaled columns."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -49,43 +48,24 @@ def triangular_of_band(rows: np.ndarray) -> np.ndarray:
     return factor
 
 
-@dataclass(frozen=True, eq=False)
-class PackedFactor:
-    """A triangular factor without the zeros below its diagonal: half the memory of a square one."""
-
-    shape: tuple[int, int]
-    """Rows and columns."""
-    values: np.ndarray
-    """Elements on and above the diagonal, row by row."""
-
-    @classmethod
-    def of(cls, factor: np.ndarray) -> 'PackedFactor':
-        """Return an upper triangular (or trapezoidal) factor packed."""
-        rows, width = factor.shape
-        return cls((rows, width), factor.ravel()[_places(width)[:_size(rows, width)]])
-
-    def unpacked(self) -> np.ndarray:
-        """Return the factor, shape (k, n)."""
-        return unpacked([self])[0]
+def packed(factor: np.ndarray) -> np.ndarray:
+    """Return an upper triangular or trapezoidal factor without its zeros, row by row."""
+    return factor[np.triu_indices(len(factor), m=factor.shape[1])]
 
 
-def unpacked(factors: Sequence[PackedFactor]) -> np.ndarray:
-    """Return factors of n columns and at most k rows in one array, shape (m, k, n); missing rows are zero."""
-    rows, width = max(factor.shape[0] for factor in factors), factors[0].shape[1]
-    found, places = np.zeros((len(factors), rows * width)), _places(width)
+def unpacked(factors: Sequence[np.ndarray], width: int) -> np.ndarray:
+    """Return packed factors of `width` columns as one stack, shape (n_factors, n_rows, width); rows of zeros complete the shorter ones."""
+    places, longest = _places(width), max(map(len, factors))
+    rows = places[longest - 1] // width + 1 if longest else 0
+    found = np.zeros((len(factors), rows * width))
     for row, factor in zip(found, factors):
-        row[places[:len(factor.values)]] = factor.values
+        row[places[:len(factor)]] = factor
     return found.reshape(len(factors), rows, width)
-
-
-def _size(rows, width):
-    """Return the number of elements on and above the diagonal."""
-    return rows * width - rows * (rows - 1) // 2
 
 
 @lru_cache(maxsize=8)
 def _places(width):
-    """Return the positions of the upper triangle in a flat square matrix, row by row."""
+    """Return the places of the upper triangle among the elements of a square matrix, row by row."""
     return np.flatnonzero(np.triu(np.ones((width, width), bool)))
 
 

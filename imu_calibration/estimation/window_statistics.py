@@ -137,10 +137,16 @@ class WindowStatistics:
     """Sensor -> regime -> rows ``[columns | d(true input)/dt | output]`` of short pieces, where a proof is wanted (see `pieces`)."""
 
 
+def references_of(windows: Sequence[Window], model: SensorModel, table: Table) -> References:
+    """Return the motion of all windows in one piece, as the sensors of a model felt it."""
+    motion, temperature = joined_motion(windows)
+    return References(model, table, motion, temperature_c=temperature)
+
+
 def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, *, session: int = 0,
-                   column_function: Callable = columns, with_pieces: bool = False) -> list[WindowStatistics]:
+                   column_function: Callable = columns) -> list[WindowStatistics]:
     """
-    Reduce windows to their statistics; the columns of all windows are computed in one call.
+    Reduce windows to their statistics without pieces; the columns of all windows are computed in one call.
 
     Parameters
     ----------
@@ -154,25 +160,21 @@ def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, 
         Recording of the windows.
     column_function : callable
         Same signature as `effects.forward_equations.columns`.
-    with_pieces : bool
-        Keep the short pieces for held-out evaluation.
 
     """
-    motion, temperature = joined_motion(windows)
-    references = References(model, table, motion, temperature_c=temperature)
-    designs = {sensor: column_function(model, sensor, table, motion=motion, temperature_c=temperature,
-                                       references=references) for sensor in SENSORS}
+    references = references_of(windows, model, table)
+    designs = {sensor: column_function(references, sensor) for sensor in SENSORS}
     edges = np.cumsum([0] + [len(window.motion) for window in windows])
-    inputs = {s: model.columns_of(s, Role.LINEAR) for s in SENSORS} if with_pieces else None
-    return [_reduced(window, {s: designs[s][a:b] for s in SENSORS}, session, inputs) for window, a, b in zip(windows, edges, edges[1:])]
+    return [_reduced(window, {s: designs[s][a:b] for s in SENSORS}, session) for window, a, b in zip(windows, edges, edges[1:])]
 
 
-def reduce_window(window: Window, model: SensorModel, table: Table, *, session: int = 0, with_pieces: bool = False) -> WindowStatistics:
-    """Reduce one window to its statistics; arguments as in `reduce_windows`."""
-    return reduce_windows([window], model, table, session=session, with_pieces=with_pieces)[0]
+def reduce_window(window: Window, model: SensorModel, table: Table, *, session: int = 0) -> WindowStatistics:
+    """Reduce one window to its statistics, with the short pieces for held-out evaluation."""
+    references = references_of([window], model, table)
+    return _reduced(window, {s: columns(references, s) for s in SENSORS}, session, {s: model.columns_of(s, Role.LINEAR) for s in SENSORS})
 
 
-def _reduced(window, designs, session, inputs):
+def _reduced(window, designs, session, inputs=None):
     outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
     static, length = window.kind == 'static', _piece_length(window)
     sensors = {s: _reduce_static(designs[s], outputs[s]) if static else _reduce_moving(designs[s], outputs[s], length) for s in SENSORS}

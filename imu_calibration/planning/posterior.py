@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import columns
+from imu_calibration.effects.forward_equations import References, columns
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.whitening import Whitening
@@ -180,7 +180,8 @@ class WindowPredictor:
         edges = np.cumsum([0] + [len(cut[0]) for cut in cuts])
         model = self.coordinates.folded
         temperature = np.full(len(motion), model.temperature_ref_c) if model.needs_temperature else None
-        designs = {sensor: columns(model, sensor, self.table, motion=motion, temperature_c=temperature) for sensor in SENSORS}
+        references = References(model, self.table, motion, temperature_c=temperature)
+        designs = {sensor: columns(references, sensor) for sensor in SENSORS}
         return [self._window(cut, {s: designs[s][a:b] for s in SENSORS}, wander) for cut, a, b in zip(cuts, edges, edges[1:], strict=False)]
 
     def _cut(self, segments) -> Iterator[tuple[JointMotion, str, float, float, float]]:

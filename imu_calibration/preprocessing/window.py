@@ -67,6 +67,11 @@ class Window:
     def __len__(self) -> int:
         return len(self.time)
 
+    def select(self, index: Any) -> 'Window':
+        """Return the samples at `index` (slice, mask or integer array)."""
+        rows = {name: value[index] for name, value in vars(self).items() if isinstance(value, np.ndarray) and name != 'joint_step'}
+        return replace(self, motion=self.motion.select(index) if len(self.motion) == len(self) else self.motion, **rows)
+
     @property
     def period(self) -> float:
         """Median sampling period, s; 0 for one sample."""

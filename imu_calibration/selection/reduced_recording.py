@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from imu_calibration.effects.forward_equations import References, all_arms, coef
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, restricted_window, selected_columns
 from imu_calibration.estimation.noise_model import sessions_of
-from imu_calibration.estimation.scaled_solve import PackedFactor, unpacked
+from imu_calibration.estimation.scaled_solve import packed, unpacked
 from imu_calibration.estimation.window_statistics import WindowStatistics, reduce_windows
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
@@ -90,6 +90,11 @@ def make_bank(effects: Sequence[Effect], constants: np.ndarray, model: SensorMod
     return bank
 
 
+def columns_with_bank(references: References, sensor: str, bank: dict[str, list[BankEntry]]) -> np.ndarray:
+    """Return the columns of `sensor` in the model of `references`, and those of the bank."""
+    return np.concatenate([columns(references, sensor), *(entry.columns(references.at(sensor)) for entry in bank[sensor])], axis=1)
+
+
 def _entry(effect, number, constant, model, values):
     own = effect.at_time_constant(constant)
     point = {**model.full_point(), effect.name: own}
@@ -122,7 +127,7 @@ class ReducedRecording:
     """Sensor -> effects with a time constant, at each of a bank; their columns are last."""
     windows: tuple[WindowStatistics, ...]
     """Reduced as for a calibration, kept one by one, without their triangular factors."""
-    factors: dict[tuple[str, str], list[PackedFactor]]
+    factors: dict[tuple[str, str], list[np.ndarray]]
     """(sensor, one of `PARTS`) -> triangular factor of the centred rows ``[columns | output]`` of each window."""
     describe: dict[str, np.ndarray]
     """Window means of variables that a residual may depend on: 'time', 'temperature', joint angles, rates; each (k,)."""
@@ -199,18 +204,21 @@ class ReducedRecording:
         chosen = np.flatnonzero(rows & self.moving)
         for at in range(0, len(chosen), UNPACKED_WINDOWS):
             some = chosen[at:at + UNPACKED_WINDOWS]
-            yield some, self._with_residual(sensor, unpacked([self.factors[sensor, part][k] for k in some]))
+            yield some, self._with_residual(sensor, unpacked([self.factors[sensor, part][k] for k in some], self._width(sensor)))
 
     def product_sum(self, sensor: str, part: str, rows: np.ndarray) -> np.ndarray:
         """Return the products of the centred rows ``[columns | residual]`` of the windows `rows` (mask), summed, shape (p + 3, p + 3)."""
         key = sensor, part, rows.tobytes()
         if key not in self._sums:
-            width = len(self.windows[0].sensors[sensor].mean)
+            width = self._width(sensor)
             total = self._sums[key] = np.zeros((width, width))
             for _, factors in self.factors_of(sensor, part, rows):
                 stacked = factors.reshape(-1, width)
                 total += stacked.T @ stacked
         return self._sums[key]
+
+    def _width(self, sensor):
+        return len(self.windows[0].sensors[sensor].mean)
 
     @cached_property
     def _sums(self):
@@ -251,7 +259,7 @@ class ReducedRecording:
 
     def _with_factors(self, k):
         """Return a window with its triangular factors."""
-        sensors = {sensor: replace(known, **{part: self.factors[sensor, part][k].unpacked() for part in PARTS})
+        sensors = {sensor: replace(known, **{part: unpacked([self.factors[sensor, part][k]], self._width(sensor))[0] for part in PARTS})
                    for sensor, known in self.windows[k].sensors.items()}
         return replace(self.windows[k], sensors=sensors)
 
@@ -273,19 +281,13 @@ def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel
         Sensor -> list of BankEntry (`make_bank`).
 
     """
-    def with_bank(model, sensor, table, motion, temperature_c=None, references: References | None = None):
-        references = references or References(model, table, motion, temperature_c=temperature_c)
-        ref = references.at(sensor)
-        return np.concatenate([columns(model, sensor, table, motion=motion, temperature_c=temperature_c, references=references),
-                               *(entry.columns(ref) for entry in bank[sensor])], axis=1)
-
     reduced = []
-    factors: dict[tuple[str, str], list[PackedFactor]] = {(sensor, part): [] for sensor in SENSORS for part in PARTS}
+    factors: dict[tuple[str, str], list[np.ndarray]] = {(sensor, part): [] for sensor in SENSORS for part in PARTS}
     for some in chunks(windows):
-        for window in reduce_windows(some, model, table, column_function=with_bank):
+        for window in reduce_windows(some, model, table, column_function=partial(columns_with_bank, bank=bank)):
             for (sensor, part), kept in factors.items():
                 factor = getattr(window.sensors[sensor], part)
-                kept.append(PackedFactor.of(window.sensors[sensor].within[:0] if factor is None else factor))
+                kept.append(np.zeros(0) if factor is None else packed(factor))
             reduced.append(replace(window, sensors={sensor: replace(known, within=known.within[:0].copy(), slow=None)
                                                     for sensor, known in window.sensors.items()}))
         report(REDUCING, len(reduced), len(windows))

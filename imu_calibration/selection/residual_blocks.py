@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import References, columns
+from imu_calibration.effects.forward_equations import References
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.session_noise import LEAST_NOISE
 from imu_calibration.kinematics.joint_motion import JointMotion
@@ -19,6 +19,7 @@ from imu_calibration.selection.explained_share import ExplainedWindows
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.noise_beside_effects import natural_processes
 from imu_calibration.selection.questions import TEMPERATURE_SPAN
+from imu_calibration.selection.reduced_recording import columns_with_bank
 from imu_calibration.selection.saturation import measured
 from imu_calibration.selection.stamp_jitter import StampJitter, jitter_ratio, stamp_jitter
 from imu_calibration.simulation.replay import predict_windows
@@ -229,9 +230,7 @@ def _block_means(problem, table, motion, temperature, starts):
         warmth = None if temperature is None else temperature[rows]
         references = References(recording.model, table, motion.select(rows), temperature_c=warmth)
         for sensor in SENSORS:
-            taken = [columns(recording.model, sensor, table, motion=references.motion, temperature_c=warmth, references=references),
-                     *(entry.columns(references.at(sensor)) for entry in recording.bank[sensor])]
-            found[sensor].append(block_means(np.concatenate(taken, axis=1), own[:-1] - own[0]))
+            found[sensor].append(block_means(columns_with_bank(references, sensor, recording.bank), own[:-1] - own[0]))
     return {sensor: np.concatenate(parts) for sensor, parts in found.items()}
 
 

@@ -1,19 +1,20 @@
 """Saturation: a limit that outputs pile up at, and the samples that it spoils."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from imu_calibration.core.distributions import norm_sf
 from imu_calibration.core.samples import rounding_variance
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import References, coefficient_jacobian, coefficients, columns
+from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
+from imu_calibration.estimation.window_statistics import references_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.full_scale import MIN_CLIPPED_SAMPLES
-from imu_calibration.preprocessing.window import Window, joined_motion
+from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS, locked_windows
 
 CLIP_MARGIN_SDS = 4.0
@@ -53,11 +54,9 @@ class Saturation:
 
 def predictions(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return (force, rate) that the model predicts, a list of pairs (n or 1, 3) per window."""
-    motion, temperature = joined_motion(windows)
-    references = References(model, table, motion, temperature_c=temperature)
+    references = references_of(windows, model, table)
     edges = np.cumsum([len(window.motion) for window in windows])[:-1]
-    outputs = [columns(model, s, table, motion=motion, temperature_c=temperature,
-                       references=references) @ coefficients(model, s, values) for s in SENSORS]
+    outputs = [columns(references, s) @ coefficients(model, s, values) for s in SENSORS]
     return list(zip(*(np.split(output, edges) for output in outputs)))
 
 
@@ -81,10 +80,9 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
     prior, sd = model.prior()
     picked = [_thinned(window) for window in windows]
     normal = np.zeros((len(values) + 1,) * 2)
-    motion, temperature = joined_motion(picked)
-    references = References(model, table, motion, temperature_c=temperature)
+    references = references_of(picked, model, table)
     for sensor in SENSORS:
-        design = columns(model, sensor, table, motion=motion, temperature_c=temperature, references=references)
+        design = columns(references, sensor)
         outputs = [measured(w, sensor) for w in picked]
         output = np.concatenate([o.mean(axis=0, keepdims=True) if w.kind == 'static' else o for w, o in zip(picked, outputs)])
         base, slope = coefficients(model, sensor, values), coefficient_jacobian(model, sensor, values)
@@ -98,7 +96,7 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
 def _thinned(window, most=50):
     if window.kind == 'static' or len(window.time) <= most:
         return window
-    return _selected(window, np.arange(0, len(window.time), len(window.time) // most))
+    return window.select(slice(None, None, len(window.time) // most))
 
 
 def may_be_clipped(windows: Sequence[Window], sensor: str) -> bool:
@@ -165,14 +163,8 @@ def without_clipped(windows: Sequence[Window], predicted: list, levels: dict[str
         if good.all():
             kept.append(window)
         elif window.kind != 'static' and good.sum() >= MIN_LEFT_SAMPLES:
-            kept.append(_selected(window, good))
+            kept.append(window.select(good))
     return kept
-
-
-def _selected(window, index):
-    temperature = None if window.temperature_c is None else window.temperature_c[index]
-    return replace(window, stamp_ns=window.stamp_ns[index], time=window.time[index], force_s=window.force_s[index],
-                   rate_s=window.rate_s[index], motion=window.motion.select(index), temperature_c=temperature)
 
 
 def windows_at(windows: Sequence[Window], rows: np.ndarray) -> list[Window]:

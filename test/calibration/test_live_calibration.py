@@ -13,7 +13,9 @@ from imu_calibration.calibration.table_calibration import calibrate, conclude, s
 from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.document.decision import HELPS
+from imu_calibration.effects import forward_equations
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.references.options import CalibrationOptions
@@ -221,7 +223,7 @@ def test_a_state_of_another_model_or_a_broken_one_is_refused(quick):
         LiveCalibration(TABLE, CalibrationOptions(accelerometer_model='bias+matrix+accel_thermal_bias'), saved=data)
     with refused(DocumentError, 'other_model', 25, 50):
         collector.require_columns(collector.from_bytes(data)[1], replace(live.model, temperature_ref_c=50.0))
-    for broken in (b'', b'nothing', data[:len(data) // 2], data.replace(b'accumulator/3', b'accumulator/9')):
+    for broken in (b'', b'nothing', data[:len(data) // 2], data.replace(b'accumulator/4', b'accumulator/9')):
         with refused(DocumentError, 'accumulator_damaged'):
             collector.from_bytes(broken)
 
@@ -263,6 +265,29 @@ def test_residuals_are_what_the_model_leaves(quick):
     noise = result.solution.noise['gyroscope'].white_sd
     assert np.all(np.abs(residuals.rate_s.std(axis=0) / noise - 1) < 0.15)
     assert set(residuals.stamp_ns) <= set(quick[0].stamp_ns)
+
+
+def test_residuals_need_the_motion_of_the_published_samples_only(quick, monkeypatch):
+    """Published residuals evaluated the kinematics of each window, which its columns need too, a second time at every sample."""
+    live, rows = LiveCalibration(TABLE, settings=LiveSettings(residual_rate=10.0)), []
+    windows = run(live, *quick)
+    live.solve(pending=True)
+    monkeypatch.setattr(forward_equations, 'reference_motion',
+                        lambda table, motion, *further, **options: rows.append(len(motion)) or reference_motion(table, motion, *further, **options))
+    residuals = live.residuals(windows)
+    assert sum(rows) <= 2 * len(residuals)   # for each sensor, or once for both
+
+
+def test_windows_of_one_kind_are_saved_in_common_columns(quick):
+    """Each small array of each window was written alone, which took ten times as long."""
+    live = LiveCalibration(TABLE)
+    run(live, *quick)
+    rows = [row for row in live.gathered().accumulator.rows if row.kind == 'static']
+    counts = []
+    for count in (len(rows) // 2, len(rows)):
+        collector._packed([rows[:count]], arrays := [])
+        counts.append(len(arrays))
+    assert counts[0] == counts[1]
 
 
 def test_memory_stays_bounded(quick):

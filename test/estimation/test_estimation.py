@@ -65,10 +65,10 @@ class SameMotion:
     def __init__(self):
         self.known = {}
 
-    def __call__(self, model, sensor, table, motion, temperature_c=None, references=None):
-        key = sensor, id(motion)
+    def __call__(self, references, sensor):
+        key = sensor, id(references.motion)
         if key not in self.known:
-            self.known[key] = columns(model, sensor, table, motion=motion, temperature_c=temperature_c)
+            self.known[key] = columns(references, sensor)
         return self.known[key]
 
     def outputs(self, session, values, rng):
@@ -78,8 +78,8 @@ class SameMotion:
                                                                                           INDUSTRIAL.gyro_instability)]
         for window in session:
             n, near = len(window.time), np.rint(window.time / 0.5).astype(int)
-            force, rate = (self(FULL, sensor, TABLE, window.motion) @ coefficients(FULL, sensor, values) + rng.normal(0, sd,
-                                                                                                                      (n, 3)) + bias[near]
+            references = References(FULL, TABLE, window.motion)
+            force, rate = (self(references, sensor) @ coefficients(FULL, sensor, values) + rng.normal(0, sd, (n, 3)) + bias[near]
                            for sensor, sd, bias in zip(('accelerometer', 'gyroscope'), WHITE, wander))
             found.append(Window(**{**vars(window), 'force_s': force, 'rate_s': rate}))
         return found
@@ -209,7 +209,7 @@ def test_columns_are_the_derivative_of_the_prediction(session, name):
             step[index] = 0.02 * effect.tolerance
             high, low = (predict(model, values + s * step, TABLE, motion=window.motion) for s in (1, -1))
             for sensor, up, down in zip(('accelerometer', 'gyroscope'), high, low):
-                design = columns(model, sensor, TABLE, motion=window.motion)
+                design = columns(References(model, TABLE, window.motion), sensor)
                 derivative = design @ (coefficients(model, sensor, values + step) - coefficients(model, sensor, values - step))
                 scale = max(np.max(np.abs(up - down)), 1e-9)
                 np.testing.assert_allclose(derivative, up - down, atol=0.01 * scale + 1e-10)
@@ -223,5 +223,4 @@ def test_a_warp_of_one_sensor_leaves_the_other_sensors_motion_alone(session):
     model, window = model.at(values), next(w for w in session if w.kind == 'dynamic')
     together = References(model, TABLE, window.motion)
     for sensor in ('accelerometer', 'gyroscope'):
-        np.testing.assert_array_equal(columns(model, sensor, TABLE, motion=window.motion, references=together),
-                                      columns(model, sensor, TABLE, motion=window.motion))
+        np.testing.assert_array_equal(columns(together, sensor), columns(References(model, TABLE, window.motion), sensor))

@@ -8,7 +8,7 @@ import pytest
 import imu_calibration
 from imu_calibration.calibration.by_evidence import _named_elsewhere
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.effects.forward_equations import coefficients, columns
+from imu_calibration.effects.forward_equations import References, coefficients, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solver import solve
@@ -42,7 +42,7 @@ def motion():
     imu, joints, _ = simulate(MODEL, MODEL.start(), TABLE, profile=profile, options=options, seed=0)
     gatherer = MotionGatherer(TABLE)
     windows = gatherer.push(SampleBlock(imu, joints)) + gatherer.finish()
-    return [(window, {s: columns(MODEL, s, TABLE, motion=window.motion) for s in SENSORS}) for window in windows]
+    return [(window, {s: columns(References(MODEL, TABLE, window.motion), s) for s in SENSORS}) for window in windows]
 
 
 def recordings(motion, values, steps, rng):
@@ -55,7 +55,7 @@ def recordings(motion, values, steps, rng):
                                                                                           (len(window.time), 3)) for s in SENSORS]
             measured = Window(**{**vars(window), 'force_s': outputs[0], 'rate_s': outputs[1]})
             part.add(*reduce_windows([measured], MODEL, TABLE, session=session,
-                                     column_function=lambda model, sensor, table, known=designs, **motion: known[sensor]))
+                                     column_function=lambda references, sensor, known=designs: known[sensor]))
         total.merge(part)
     return total
 

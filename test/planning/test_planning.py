@@ -14,7 +14,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.effects.forward_equations import columns
+from imu_calibration.effects.forward_equations import References, columns
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.estimation.window_statistics import batch_statistics
@@ -301,7 +301,7 @@ def test_a_moving_window_is_foretold_with_the_bias_wandering_in_it(table):
         wander = [[process.sd**2 * (np.exp(-abs(a - b) / process.time) - np.exp(-(abs(a) + abs(b)) / process.time)) for b in offsets]
                   for a in offsets]
         inverse = np.linalg.inv(np.diag(np.full(count, own.low_variance[0] * count / found.samples)) + wander)
-        design, slope, mean = columns(coordinates.folded, sensor, table, motion=motion), coordinates.slopes[sensor], found.means[sensor]
+        design, slope, mean = columns(References(coordinates.folded, table, motion), sensor), coordinates.slopes[sensor], found.means[sensor]
         total = total + sum(slope[:, axis].T @ design.T @ inverse @ design @ slope[:, axis] for axis in range(3))
         predicted = predicted + mean.T @ mean * inverse.sum()
         np.testing.assert_allclose(found.variance[sensor], 1 / inverse.sum(), rtol=1e-9)
@@ -313,9 +313,9 @@ def test_the_memory_of_a_plan_does_not_grow_with_the_square_of_an_arms_joints(ta
     """All moves of seven joints at once took 5.7 GB: columns are computed by blocks, and a long chain has few places."""
     lengths = []
 
-    def counted(*arguments, motion, **options):
-        lengths.append(len(motion))
-        return columns(*arguments, motion=motion, **options)
+    def counted(references, sensor):
+        lengths.append(len(references.motion))
+        return columns(references, sensor)
 
     monkeypatch.setattr(posterior, 'columns', counted)
     model = choose_model(CalibrationOptions(), table)

@@ -102,7 +102,7 @@ class StoredRecording:
             self._first = step.read(source(), session, Preflight(step.table.gravity_value), windows=self.windows)
             return [self._first]
         windows = (self.windows[number] for number in range(len(self.windows)))
-        reduced = (reduce_window(window, step.model, step.table, session=session, with_pieces=True) for window in windows
+        reduced = (reduce_window(window, step.model, step.table, session=session) for window in windows
                    if window.kind != 'unused')
         return [self._first.anew(reduced, step.judged_from)]
 

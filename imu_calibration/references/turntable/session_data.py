@@ -8,7 +8,7 @@ import numpy as np
 
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import columns
+from imu_calibration.effects.forward_equations import References, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, restrict, selected_columns, stack
 from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular
@@ -66,7 +66,7 @@ class WindowStore:
         """Yield all windows in order with the columns of `model`, as `calibration.collector` reduces them."""
         for entry in self._entries:
             if isinstance(entry, Window):
-                yield reduce_window(entry, model, table, session=session, with_pieces=True)
+                yield reduce_window(entry, model, table, session=session)
             else:
                 yield _again(entry, model, table)
 
@@ -74,8 +74,8 @@ class WindowStore:
 def _again(entry, model, table):
     """Return a static window's statistics with recomputed columns."""
     reduced, motion, temperature = entry
-    sensors = {name: replace(known, mean=np.concatenate([columns(model, name, table, motion=motion, temperature_c=temperature).mean(axis=0),
-                                                         known.mean[-3:]]))
+    references = References(model, table, motion, temperature_c=temperature)
+    sensors = {name: replace(known, mean=np.concatenate([columns(references, name).mean(axis=0), known.mean[-3:]]))
                for name, known in reduced.sensors.items()}
     return replace(reduced, sensors=sensors, pieces={name: pieces_at_rest(known.mean, reduced.duration) for name, known in sensors.items()})
 
