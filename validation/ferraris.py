@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions, KnownTurn
+from imu_calibration.references.gravity.hand_parameters import HandOptions, KnownTurn
 from validation.recordings import load, reference
 from validation.second_opinions import FACES, TURNS, accelerometer_of, ferraris, installed
 from validation.section import Section, text

@@ -5,7 +5,7 @@ from scipy.stats import t
 
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 from validation.ferraris import GRAVITY, RATE_HZ, calibrate_sections, known_turns
 from validation.ferraris import NAME as FERRARIS
 from validation.recordings import BY_HAND, gravity_of, label, load, reference

@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand, gather_by_hand, solve_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 from validation.hand_peers import imu_calib, imu_tk, turned
 from validation.peers import WITHIN
 from validation.recordings import gravity_of, load, reference

@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 from validation.recordings import gravity_of, load, nominal_of, reference
 from validation.section import Section, listed, text
 

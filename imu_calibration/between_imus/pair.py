@@ -9,7 +9,7 @@ from imu_calibration.core.samples import AlignedArrays, ImuSamples
 from imu_calibration.kinematics.rotations import nearest_rotation, skew
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, calibrate_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 
 SINE_POWER = 6
 """The weight is sin^6: with eight samples per window its sums equal its integrals, and its ends are smooth to fifth order."""

@@ -16,9 +16,8 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import observability
-from imu_calibration.estimation.covariance_terms import GRAVITY, REJECTED, with_term
 from imu_calibration.estimation.observability import Motion, motions_about
-from imu_calibration.estimation.solution import Solution, reasons_held, statuses
+from imu_calibration.estimation.solution import GRAVITY, REJECTED, Solution, reasons_held, statuses, with_term
 from imu_calibration.estimation.weighted_system import make_prior
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import unusable, warnings

@@ -10,8 +10,8 @@ import numpy as np
 
 from imu_calibration.calibration.coverage import Coverage, GroupState, group_states, waiting_groups
 from imu_calibration.calibration.hand_workflow import HandRecording, HandResult, evident_result
+from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings, SolvePacer
 from imu_calibration.calibration.pose_scan import EMPTY_SCAN, hand_coverage, hand_status, look_for_poses
-from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SolvePacer
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -21,8 +21,7 @@ from imu_calibration.preprocessing.stamping import StampLine
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.gravity.hand_calibration import MIN_ATTITUDES, POSES_FULL
-from imu_calibration.references.gravity.hand_options import hand_options
-from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.references.gravity.hand_parameters import HandModel, hand_options
 from imu_calibration.references.gravity.sample_store import HandStore
 from imu_calibration.references.options import CalibrationOptions
 

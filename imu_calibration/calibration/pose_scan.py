@@ -20,10 +20,8 @@ from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.gravity.equations import Poses
 from imu_calibration.references.gravity.hand_calibration import MIN_ATTITUDES, POSES_FULL
-from imu_calibration.references.gravity.hand_options import HandOptions
-from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.references.gravity.poses import average_poses, distinct_attitudes
-from imu_calibration.references.gravity.turns import collect_turns
+from imu_calibration.references.gravity.hand_parameters import HandModel, HandOptions
+from imu_calibration.references.gravity.poses import average_poses, collect_turns, distinct_attitudes
 
 FACE_DIRECTIONS = {f'{sign}{axis}': direction for axis, unit in zip('xyz', np.eye(3)) for sign, direction in (('+', unit), ('-', -unit))}
 """The six directions that can be turned up."""

@@ -14,8 +14,7 @@ from imu_calibration.core.units import DEG, STANDARD_GRAVITY, for_people, signif
 from imu_calibration.document.decision import BY_DEFINITION, SensorDecision, Verdict, decide, decisions_text, most_cautious
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.covariance_terms import GRAVITY
-from imu_calibration.estimation.solution import COMMON_SCALE, DETERMINED, FIXED, HELD, Status
+from imu_calibration.estimation.solution import COMMON_SCALE, DETERMINED, FIXED, GRAVITY, HELD, Status
 
 UNKNOWN_SD = 'unknown'
 """Entry of the provenance for the uncertainty of imported values."""
@@ -56,7 +55,7 @@ class Calibration:
     Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on held-out data; {}: never measured.
     """
     covariance_terms: dict[str, np.ndarray] = field(default_factory=dict)
-    """Term (`estimation.covariance_terms`) -> its variance of each parameter, shape (n_params,); the sum is that of `covariance`."""
+    """Term (`estimation.solution`) -> its variance of each parameter, shape (n_params,); the sum is that of `covariance`."""
     held_reason: dict[str, str] = field(default_factory=dict)
     """Held parameter -> the reason (`status.reasons_held`)."""
     judgement: Verdict | None = None

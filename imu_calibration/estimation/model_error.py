@@ -15,10 +15,10 @@ from imu_calibration.core.distributions import chi2_sf, f_sf
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.covariance_terms import DRIFT, MODEL_ERROR
 from imu_calibration.estimation.noise_model import NoiseModel, dof_factor
 from imu_calibration.estimation.row_estimate import RowEstimate, RowSet
 from imu_calibration.estimation.scaled_solve import inverse_normal
+from imu_calibration.estimation.solution import DRIFT, MODEL_ERROR
 from imu_calibration.estimation.weighted_system import WeightedSystem
 
 MIN_SCATTER_BLOCKS = 8
@@ -51,7 +51,7 @@ class ModelError:
     """Variance to add for a bias that depends on the attitude, shape (n_params,)."""
 
     def terms(self, covariance: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the terms (`covariance_terms`) to add to the covariance from noise and fixed parameters."""
+        """Return the terms to add to the covariance from noise and fixed parameters."""
         scaled = covariance * (np.outer(self.factor, self.factor) - 1.0)
         return {MODEL_ERROR: scaled + np.diag(self.scatter_variance), DRIFT: np.diag(self.drift_variance)}
 

@@ -12,9 +12,9 @@ from typing import Any, Protocol
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE
 from imu_calibration.estimation.noise_search import GroupVariances, estimate_group_variances
 from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, triangular_of_band
+from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE
 
 MAX_NEWTON_STEPS = 15
 """Largest number of Gauss-Newton steps; four to six are usual."""
@@ -64,7 +64,7 @@ class RowEstimate:
     state: Any
     """Parameters and nuisances."""
     terms: Mapping[str, np.ndarray]
-    """Covariance of the parameters as named terms (`covariance_terms`), each of shape (n, n)."""
+    """Covariance of the parameters as named terms, each of shape (n, n)."""
     held: np.ndarray
     """True where a parameter is fixed at its prior, shape (n,)."""
     free: np.ndarray

@@ -10,12 +10,11 @@ from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, not_separable
-from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE
 from imu_calibration.estimation.model_error import model_error
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, inverse_normal, scaled_lstsq
 from imu_calibration.estimation.session_noise import first_noise, updated_noise
-from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE, Solution
 from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters
 from imu_calibration.estimation.whitening import predict_session_offsets
 

@@ -19,9 +19,8 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.live import LiveByHandSettings, LiveCalibration, LiveSettings
 from imu_calibration.calibration.live_poses import LiveByHand
-from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files

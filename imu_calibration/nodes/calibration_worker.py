@@ -15,10 +15,9 @@ from typing import Any
 
 from imu_calibration.calibration.coverage import all_determined
 from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
-from imu_calibration.calibration.live import LiveCalibration
+from imu_calibration.calibration.live import LiveByHandSettings, LiveCalibration, LiveSettings, SolvePacer
 from imu_calibration.calibration.live_poses import LiveByHand
 from imu_calibration.calibration.result import CalibrationResult, summary
-from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings, SolvePacer
 from imu_calibration.core.errors import ImuCalibrationError, NotObservableError, shortened
 from imu_calibration.document import files
 from imu_calibration.document.calibration_text import calibration_to_text

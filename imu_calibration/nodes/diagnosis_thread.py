@@ -9,7 +9,7 @@ from typing import Any
 
 from imu_calibration.calibration.diagnosis.live_diagnosis import FAILED, NOT_YET, OFF, Answer, DiagnosisQuestion
 from imu_calibration.calibration.from_solution import ModelExtension
-from imu_calibration.calibration.session import SolvePacer
+from imu_calibration.calibration.live import SolvePacer
 from imu_calibration.core.progress import LiveState, listening
 from imu_calibration.selection.reduced_recording import REDUCING
 

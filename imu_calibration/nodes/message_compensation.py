@@ -5,8 +5,7 @@ import numpy as np
 from imu_calibration.compensation.compensate import FittedErrors, Transfer
 from imu_calibration.compensation.covariance import is_known
 from imu_calibration.compensation.health import StopWatch
-from imu_calibration.compensation.sample_compensation import SampleCompensation
-from imu_calibration.compensation.stream import late_ns
+from imu_calibration.compensation.stream import SampleCompensation, late_ns
 from imu_calibration.preprocessing.recording_evidence import ABSENT_MARK
 from msg_adapters.imu_stream import ImuStream
 from msg_adapters.layout import MessageError

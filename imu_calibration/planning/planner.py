@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.advice import foretold, knowledge_at_first
-from imu_calibration.calibration.hand_step import HOLD_TIME, TURN_RATE
+from imu_calibration.calibration.advice import HOLD_TIME, TURN_RATE, foretold, knowledge_at_first
 from imu_calibration.core.progress import report
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.sensor_model import SensorModel

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.hand_step import HandStep, direction_words
+from imu_calibration.calibration.advice import HandStep, direction_words
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.rotations import align
 from imu_calibration.planning.motion_library import MotionKind

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.band_misfit import band_misfit, least_misfit, misfit_along
 from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise
 from imu_calibration.estimation.noise_search import CORRELATION_TIMES, NATURAL, BiasProcessSearch, NoiseLikelihood
 from imu_calibration.estimation.scaled_solve import solve_normal
-from imu_calibration.estimation.session_noise import shaken_means, white_noise
+from imu_calibration.estimation.session_noise import band_misfit, least_misfit, misfit_along, shaken_means, white_noise
 from imu_calibration.selection.parameter_space import ParameterSpace, normal_matrix, within_matrix
 
 

@@ -13,8 +13,7 @@ from imu_calibration.selection.explained_share import MIN_EXPLAINED_SHARE, SIGNI
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.parameter_space import matrix_of_each
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.residual_blocks import residuals
-from imu_calibration.selection.residual_fit import largest_axes
+from imu_calibration.selection.residual_blocks import largest_axes, residuals
 
 MIN_ONSET_WINDOWS = MIN_FOLD_WINDOWS + 1
 """Least number of moving windows before and after an onset: the longer part, without the window of the onset, can be searched."""

@@ -12,8 +12,7 @@ from imu_calibration.estimation.observability import ALL_MOTIONS
 from imu_calibration.selection.explained_share import MIN_SMOOTH_SHARE
 from imu_calibration.selection.formulas import FormulaChoice, FormulaSearch, grammar
 from imu_calibration.selection.linearised_problem import LinearisedProblem
-from imu_calibration.selection.residual_blocks import RestBlocks
-from imu_calibration.selection.residual_fit import BlockFit, BlockFits, share_interval, share_removed
+from imu_calibration.selection.residual_blocks import BlockFit, BlockFits, RestBlocks, share_interval, share_removed
 
 MIN_FORMULA_SHARE = 0.6
 """Share of the excess that a formula removes from held-out windows at least."""

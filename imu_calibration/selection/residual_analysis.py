@@ -17,8 +17,7 @@ from imu_calibration.selection.investigation import Investigation, investigate
 from imu_calibration.selection.proposals import Proposal, find_formulas, propose
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regimes import RestRegime, find_regimes
-from imu_calibration.selection.residual_blocks import RestBlocks, rest_blocks
-from imu_calibration.selection.residual_fit import BlockFits
+from imu_calibration.selection.residual_blocks import BlockFits, RestBlocks, rest_blocks
 from imu_calibration.selection.spectrum import find_tones
 from imu_calibration.selection.stamp_jitter import StampJitter
 from imu_calibration.selection.unexplained import Unexplained, beyond_noise, unexplained

@@ -12,7 +12,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.explained_share import ExplainedWindows
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.residual_fit import largest_axes
+from imu_calibration.selection.residual_blocks import largest_axes
 
 SIGNIFICANT_SDS = 5.0
 """Standard deviations above noise from which a rest is significant."""

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 from os import PathLike
 
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.hand_by_evidence import EvidentHand
-from imu_calibration.calibration.hand_workflow import HandResult, hand_result, read_by_hand
+from imu_calibration.calibration.hand_workflow import EvidentHand, HandResult, hand_result, read_by_hand
 from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import ImuCalibrationError
@@ -15,7 +14,7 @@ from imu_calibration.preprocessing.checks import Preflight, unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
 from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
-from imu_calibration.references.gravity.hand_options import hand_options
+from imu_calibration.references.gravity.hand_parameters import hand_options
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.use_cases.recordings import Source, Topics, open_bag, source_of

@@ -35,7 +35,7 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import tolerances_of
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 from imu_calibration.report.diagnosis_page import WHEN, histogram
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.choices import Choices

@@ -18,8 +18,7 @@ from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.calibration.live_poses import LiveByHand
 from imu_calibration.cli.main import main
-from imu_calibration.compensation.sample_compensation import SampleCompensation
-from imu_calibration.compensation.stream import CompensationStream
+from imu_calibration.compensation.stream import CompensationStream, SampleCompensation
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files

@@ -11,7 +11,7 @@ import imu_calibration as imu
 from imu_calibration.calibration import by_evidence
 from imu_calibration.calibration.by_evidence import _moves, extended_solution, stands_out
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
-from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
+from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel

@@ -6,10 +6,10 @@ from test_diagnosis_by_hand import HIDDEN, NOTHING
 from test_live_by_hand import assert_same, make_live, run
 
 import imu_calibration as imu
-from imu_calibration.calibration.hand_by_evidence import solve_by_evidence
+from imu_calibration.calibration.hand_workflow import solve_by_evidence
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 
 from worlds.hand_sessions import GRAVITY, PARAM_NAMES, simulate
 from worlds.physics_hand import hold_and_turn, warmed_up

@@ -6,16 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.advice import WEIGHTS, _rollout, foretold
+from imu_calibration.calibration.advice import WEIGHTS, HandStep, _rollout, direction_words, foretold, shortest_turn
 from imu_calibration.calibration.coverage import DIRECTIONS, MIN_CELL_WORTH, Coverage, Step, line_of, table_coverage
-from imu_calibration.calibration.hand_step import HandStep, direction_words, shortest_turn
+from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.live_poses import LiveByHand
 from imu_calibration.calibration.pose_scan import EMPTY_SCAN, hand_coverage, knowledge_of
-from imu_calibration.calibration.session import LiveByHandSettings, LiveSettings
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.estimation.observability import MOTIONS, motions_about
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.calibrate import calibrate
 

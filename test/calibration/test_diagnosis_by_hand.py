@@ -11,17 +11,16 @@ from refusal import refused
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.hand_diagnosis import told_by_hand
-from imu_calibration.calibration.hand_by_evidence import extended_by_hand, solve_by_evidence
+from imu_calibration.calibration.diagnosis.findings import told_by_hand
+from imu_calibration.calibration.hand_workflow import extended_by_hand, solve_by_evidence
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.kinematics.table import Table
-from imu_calibration.references.gravity import pose_residuals
-from imu_calibration.references.gravity.effect_rows import build_rows
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 from imu_calibration.references.gravity.model_selection import HandProblem, investigate_by_hand
+from imu_calibration.references.gravity.pose_evidence import build_rows, regimes_by_hand
 from imu_calibration.selection import regimes
 from imu_calibration.selection.gain import APPLIED, OF_MODEL
 from imu_calibration.simulation.profiles import make_profile
@@ -126,7 +125,7 @@ def test_a_place_among_few_poses_is_paid_for(monkeypatch):
         up = rng.normal(size=(24, 3))
         hand = SimpleNamespace(gravity=GRAVITY, state=SimpleNamespace(up=up / np.linalg.norm(up, axis=1, keepdims=True)), poses=poses)
         block = SimpleNamespace(sensor='gyroscope', floor=np.ones((24, 3)), pose=np.arange(24), time=poses.time)
-        told += pose_residuals.regimes_by_hand(hand, block, rng.normal(size=(24, 3)))
+        told += regimes_by_hand(hand, block, rng.normal(size=(24, 3)))
     assert len(told) <= 2
 
 

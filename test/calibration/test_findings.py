@@ -5,9 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.diagnosis import hand_diagnosis as by_hand
-from imu_calibration.calibration.diagnosis import table_diagnosis as on_a_table
-from imu_calibration.calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST, candidates_of, finding, motions_of_one_joint, sentence
+from imu_calibration.calibration.diagnosis.findings import DISAGREED, LEAVES_MOST, candidates_of, finding, motions_of_one_joint, sentence
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.observability import OTHER_MOUNT
@@ -80,11 +78,6 @@ def test_what_is_not_named_for_its_windows_disagree_is_not_said_to_leave_the_res
     asked = []
     rows = {row.effect: row.verdict for row in candidates_of(Search(), [], agree=lambda *those: asked.append(those) or agree)}
     assert rows[FIRST.name] == verdict and ([FIRST], FIRST) in asked
-
-
-def test_both_diagnoses_put_findings_together_in_one_place():
-    assert on_a_table.finding is by_hand.finding is finding
-    assert on_a_table.candidates_of is by_hand.candidates_of is candidates_of
 
 
 def test_what_explains_much_but_leaves_most_is_said():

@@ -7,8 +7,7 @@ import pytest
 from refusal import refused
 
 from imu_calibration.calibration import collector
-from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.calibration.session import LiveSettings, SolvePacer
+from imu_calibration.calibration.live import LiveCalibration, LiveSettings, SolvePacer
 from imu_calibration.calibration.table_calibration import calibrate, conclude, solve_gathered
 from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples

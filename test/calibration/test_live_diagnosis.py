@@ -11,8 +11,7 @@ from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.diagnosis.live_diagnosis import Answer, describe, question_about
 from imu_calibration.calibration.from_solution import ModelExtension
-from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.calibration.session import LiveSettings
+from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.progress import LiveState, report
 from imu_calibration.core.samples import SampleBlock

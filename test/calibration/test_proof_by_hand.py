@@ -9,7 +9,7 @@ from imu_calibration.calibration.hand_proof import HAND_PROOF_FOLDS, prove_by_ha
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import HELPS, decide
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 from imu_calibration.use_cases.calibrate import calibrate
 
 from worlds.hand_sessions import GRAVITY, NOMINAL, simulate

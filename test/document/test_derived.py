@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from papers import zhang2017 as zhang
 
-from imu_calibration.calibration.diagnosis.sentences import sentence
+from imu_calibration.calibration.diagnosis.findings import sentence
 from imu_calibration.calibration.installation_angles import AXIS_PAIRS, angles_of, derive, in_paper_units, split
 from imu_calibration.core.samples import NominalScaling
 from imu_calibration.core.units import NOISE_QUANTITY, decimals, for_people, significant, with_sd

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.diagnosis.sentences import sentence
+from imu_calibration.calibration.diagnosis.findings import sentence
 from imu_calibration.cli.main import main
 from imu_calibration.core import documents
 from imu_calibration.core.errors import ImuCalibrationError, InputError

@@ -11,8 +11,7 @@ from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.compensation.compensate import invertible_values
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text, from_mapping, to_mapping
-from imu_calibration.estimation.covariance_terms import BIAS_PROCESS, HELD_PRIORS, REJECTED, SAMPLE_NOISE, replace_weak, total
-from imu_calibration.estimation.solution import REPLACEMENT
+from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, REJECTED, REPLACEMENT, SAMPLE_NOISE, replace_weak, total
 
 SESSION = imu.simulate('quick', seed=2)
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.core.samples import rounding_variance
-from imu_calibration.estimation.band_misfit import least_misfit, misfit_along
 from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise, dof_factor
-from imu_calibration.estimation.session_noise import white_noise
+from imu_calibration.estimation.session_noise import least_misfit, misfit_along, white_noise
 from imu_calibration.selection.saturation import noise_at_rest
 from imu_calibration.simulation.sensor_noise import gauss_markov
 

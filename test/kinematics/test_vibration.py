@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.compensation.sample_compensation import SampleCompensation
-from imu_calibration.compensation.stream import CompensationStream
+from imu_calibration.compensation.stream import CompensationStream, SampleCompensation
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.session_noise import white_noise

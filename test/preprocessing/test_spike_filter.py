@@ -11,7 +11,7 @@ from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 
 from worlds.cleaning import clean_samples
 from worlds.hand_sessions import GRAVITY

@@ -9,7 +9,7 @@ from refusal import refused
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.calibration.advice import missing_motion
-from imu_calibration.calibration.session import LiveByHandSettings
+from imu_calibration.calibration.live import LiveByHandSettings
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, NominalScaling
 from imu_calibration.effects.sensor_model import SensorModel
@@ -20,8 +20,7 @@ from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.equations import GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence
 from imu_calibration.references.gravity.hand_calibration import GAUGE, calibrate_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions, KnownTurn, hand_options
-from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.references.gravity.hand_parameters import HandModel, HandOptions, KnownTurn, hand_options
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.choices import calibration_options
 
@@ -284,7 +283,7 @@ def test_six_faces_leave_the_cross_axis_terms_held_and_say_what_to_do(monkeypatc
     """Without the turns, that is: the angles between the faces as the gyroscope saw them do say something."""
     truth = NOMINAL.copy()
     imu, ranges, _ = simulate(9, n_poses=6, attitudes=face_attitudes(FACES), truth=truth)
-    monkeypatch.setattr('imu_calibration.references.gravity.turns.TURN_LONGEST', 0.5)
+    monkeypatch.setattr('imu_calibration.references.gravity.poses.TURN_LONGEST', 0.5)
     found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
     status = dict(zip(found.param_names, found.statuses))
     for name in ('yx', 'zx', 'zy'):

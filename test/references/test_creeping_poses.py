@@ -5,7 +5,7 @@ import pytest
 
 from imu_calibration.references.gravity import poses as poses_module
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 
 from worlds.hand_sessions import GRAVITY
 from worlds.physics_hand import hold_and_turn

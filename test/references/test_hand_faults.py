@@ -12,18 +12,15 @@ from imu_calibration.calibration.hand_workflow import HandRecording, evident_res
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
-from imu_calibration.estimation.covariance_terms import of_fit
-from imu_calibration.estimation.solution import reasons_held, with_weak_replaced
+from imu_calibration.estimation.solution import of_fit, reasons_held, with_weak_replaced
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions, hand_options
-from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, UPPER_TERMS
-from imu_calibration.references.gravity.poses import average_poses
-from imu_calibration.references.gravity.turns import at_range_end, rising, sample_times
+from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, UPPER_TERMS, HandOptions, hand_options
+from imu_calibration.references.gravity.poses import at_range_end, average_poses, rising, sample_times
 from imu_calibration.references.options import CalibrationOptions
 
 from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth, unpack

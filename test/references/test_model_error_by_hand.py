@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.estimation.covariance_terms import DRIFT, MODEL_ERROR
+from imu_calibration.estimation.solution import DRIFT, MODEL_ERROR
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 
 from worlds.hand_coverage import GROUPS, errors
 from worlds.hand_sessions import GRAVITY, PARAM_NAMES

@@ -8,8 +8,8 @@ import pytest
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
 
-from imu_calibration.estimation.covariance_terms import total
 from imu_calibration.estimation.row_estimate import RowSet, estimate_rows
+from imu_calibration.estimation.solution import total
 from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
 
 BLOCK, GAP, STEP, MARGIN = 1.0, 0.03, 0.05, 0.1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
+from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.cli.main import main
 from imu_calibration.document import files
 from imu_calibration.effects.expressions import ColumnGroup
@@ -19,7 +19,7 @@ from imu_calibration.selection.proposals import find_formulas, propose
 from imu_calibration.selection.regime_variables import variables_of
 from imu_calibration.selection.regimes import find_regimes
 from imu_calibration.selection.residual_analysis import ResidualAnalysis, without_superseded
-from imu_calibration.selection.residual_fit import BlockFits, share_interval, share_removed
+from imu_calibration.selection.residual_blocks import BlockFits, share_interval, share_removed
 
 from worlds import physics
 from worlds.beyond_catalogue import row_of

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
+from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.effects.base import Role
 from imu_calibration.selection.investigation import investigate
 

@@ -9,8 +9,7 @@ import pytest
 from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.selection import regimes
 from imu_calibration.selection.regime_variables import Variable, ranged
-from imu_calibration.selection.residual_blocks import RestBlocks
-from imu_calibration.selection.residual_fit import BlockFits
+from imu_calibration.selection.residual_blocks import BlockFits, RestBlocks
 from imu_calibration.selection.stamp_jitter import StampJitter
 
 WINDOWS, EACH = 60, 4

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
+from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.catalogue import term
 from imu_calibration.kinematics.table import Table

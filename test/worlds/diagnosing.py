@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
+from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.diagnosis.traces import residual_traces
 from imu_calibration.selection.residual_analysis import inquire
 

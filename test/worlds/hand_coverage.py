@@ -4,11 +4,11 @@ from argparse import ArgumentParser
 
 import numpy as np
 
-from imu_calibration.calibration.hand_by_evidence import solve_by_evidence
+from imu_calibration.calibration.hand_workflow import solve_by_evidence
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.covariance_terms import HELD_PRIORS, of_fit
+from imu_calibration.estimation.solution import HELD_PRIORS, of_fit
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
+from imu_calibration.references.gravity.hand_parameters import HandOptions
 
 from worlds.hand_sessions import GRAVITY, PARAM_NAMES
 from worlds.physics_hand import hold_and_turn, warmed_up

@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
+from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import heldout_gain
 from imu_calibration.selection.investigation import investigate

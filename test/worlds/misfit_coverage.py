@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.estimation.accumulator import Accumulator
-from imu_calibration.estimation.covariance_terms import HELD_PRIORS, of_fit
-from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.solution import HELD_PRIORS, Solution, of_fit
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table

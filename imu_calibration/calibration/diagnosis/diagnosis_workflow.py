@@ -9,9 +9,7 @@ import numpy as np
 from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, formula_gain, to_mapping
-from imu_calibration.calibration.diagnosis.hand_diagnosis import told_by_hand
-from imu_calibration.calibration.diagnosis.sentences import DISAGREED, LEAVES_MOST
-from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
+from imu_calibration.calibration.diagnosis.findings import DISAGREED, LEAVES_MOST, build_diagnosis, told_by_hand
 from imu_calibration.calibration.diagnosis.traces import residual_traces
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.hand_workflow import evident_result, read_by_hand
@@ -158,7 +156,7 @@ def _with_proposals(source, table, options, result, diagnosis, provenance, reade
 def diagnose_without_table(source: Callable, options: CalibrationOptions = CalibrationOptions(),
                            provenance: dict[str, Any] | None = None) -> DiagnosisResult:
     """
-    Calibrate a recording by hand, identify the errors of the model and their causes, and extend it (see `hand_diagnosis`).
+    Calibrate a recording by hand, identify the errors of the model and their causes, and extend it (see `findings`).
 
     Parameters
     ----------

@@ -7,10 +7,9 @@ from typing import Any
 from imu_calibration.calibration.by_evidence import windows_to_ask
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines, in_words, nothing_named
-from imu_calibration.calibration.diagnosis.table_diagnosis import build_diagnosis
+from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.from_solution import ModelExtension
-from imu_calibration.calibration.live import LiveCalibration
-from imu_calibration.calibration.session import LiveSnapshot
+from imu_calibration.calibration.live import LiveCalibration, LiveSnapshot
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.progress import LiveState
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS

@@ -11,17 +11,22 @@ from imu_calibration.core.progress import report
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
-from imu_calibration.estimation.covariance_terms import DRIFT, GRAVITY, total, with_term
-from imu_calibration.estimation.solution import Solution, Status, statuses, tolerances_of
+from imu_calibration.estimation.solution import DRIFT, GRAVITY, Solution, Status, statuses, tolerances_of, total, with_term
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import bias_movements, with_movement, without_movement
 from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
-from imu_calibration.references.gravity.hand_options import HandOptions, KnownTurn
-from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandModel
+from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandModel, HandOptions, KnownTurn
 from imu_calibration.references.gravity.pose_solver import first_state, possible_turns, solve_joint, without_outliers
-from imu_calibration.references.gravity.poses import average_poses, distinct_attitudes, noise_statistics
-from imu_calibration.references.gravity.turns import collect_turns, full_scale_factor, known_turn_data, sample_times
+from imu_calibration.references.gravity.poses import (
+    average_poses,
+    collect_turns,
+    distinct_attitudes,
+    full_scale_factor,
+    known_turn_data,
+    noise_statistics,
+    sample_times,
+)
 from imu_calibration.selection.questions import at_time_constants
 
 GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}

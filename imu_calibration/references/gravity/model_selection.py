@@ -10,14 +10,11 @@ from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.progress import reported
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE
-from imu_calibration.references.gravity.effect_rows import Block, HandSpace, build_rows, gravity_turns
 from imu_calibration.references.gravity.equations import TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_calibration import HandCalibration, HandData, solve_by_hand
-from imu_calibration.references.gravity.hand_options import HandOptions
-from imu_calibration.references.gravity.hand_parameters import HandModel, possible_by_hand
-from imu_calibration.references.gravity.pose_evidence import HandEvidence
-from imu_calibration.references.gravity.pose_residuals import unexplained_by_hand
+from imu_calibration.references.gravity.hand_parameters import HandModel, HandOptions, possible_by_hand
+from imu_calibration.references.gravity.pose_evidence import Block, HandEvidence, HandSpace, build_rows, gravity_turns, unexplained_by_hand
 from imu_calibration.selection.evidence import agree
 from imu_calibration.selection.explained_share import Explained, pruned
 from imu_calibration.selection.gain import OF_MODEL, Gain, gain_of

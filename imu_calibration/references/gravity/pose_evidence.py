@@ -1,17 +1,186 @@
-"""Evidence from a recording without a table: few poses, so that variances are estimated too and every pose is held out in turn."""
+"""
+Evidence from a recording without a table: norms of gravity in poses, rates at rest, directions after turns, and their residual.
+
+Poses are few, so that variances are estimated too and every pose is held out in turn.
+"""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from imu_calibration.core.distributions import f_sf
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.core.samples import AlignedArrays
+from imu_calibration.effects.base import AXES, SENSORS, Effect
+from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.estimation.noise_model import BiasProcess
-from imu_calibration.estimation.noise_search import NoiseLikelihood
+from imu_calibration.estimation.noise_search import NATURAL, NoiseLikelihood
 from imu_calibration.estimation.whitening import Whitening
+from imu_calibration.kinematics.rotations import skew
+from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.references.gravity.bias_movement import orthonormal_basis
-from imu_calibration.references.gravity.effect_rows import Block, HandSpace
+from imu_calibration.references.gravity.equations import TurnData, between_middles, tangent
+from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
+from imu_calibration.references.gravity.hand_calibration import HandCalibration
+from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.selection.evidence import Evidence
+from imu_calibration.selection.regime_variables import Variable, ranged
+from imu_calibration.selection.regimes import REGIME_LEVEL, AxisResidual, RegimeSearch, RestRegime, exchanges
+from imu_calibration.selection.residual_blocks import largest_axes
+from imu_calibration.selection.unexplained import MIN_EXPLAINED_WINDOWS, SIGNIFICANT_SDS, Unexplained, correlate, slow_explanations
+
+
+@dataclass(frozen=True, eq=False)
+class Block(AlignedArrays):
+    """Rows of one kind, ``residual = columns @ parameters + error``, in the unit of their sensor."""
+
+    name: str
+    """'poses' or 'turns'."""
+    sensor: str
+    """'accelerometer' or 'gyroscope'."""
+    rows: np.ndarray
+    """``[columns | residual]`` at the baseline, shape (m, n_axes, q + 1); different axes have independent errors."""
+    known: np.ndarray
+    """Variance by the noise of the samples, shape (m, n_axes)."""
+    floor: np.ndarray
+    """The same plus the usual bias drift, shape (m, n_axes)."""
+    pose: np.ndarray
+    """Pose of each row (of a turn: the pose before it), shape (m,)."""
+    time: np.ndarray
+    """Seconds since the first sample, shape (m,)."""
+    duration: np.ndarray | None = None
+    """Of each turn, s, shape (m,): residuals of turns times it are angles; None for poses."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandSpace:
+    """Parameters of a diagnosis by hand: baseline, Earth's rate about the vertical, then one run per column set."""
+
+    parts: dict
+    """Label of each run of columns (effect name, for a warm-up with the number of its time constant) -> slice."""
+    prior_sd: np.ndarray
+    """Shape (q,); wide for the baseline, which is linearised at its own solution."""
+    size: int
+    """Number of parameters."""
+
+
+def build_rows(hand: HandCalibration, turns: Sequence[TurnData], effects: Sequence[Effect], *,
+               constants: np.ndarray) -> tuple[list[Block], HandSpace]:
+    """
+    Return (blocks, HandSpace).
+
+    Parameters
+    ----------
+    hand : HandCalibration
+        Of the baseline.
+    turns : list of TurnData
+        Between consecutive poses.
+    effects : sequence of Effect
+        Effects under test.
+    constants : array
+        Time constants of warm-ups under test, s.
+
+    """
+    sets: list[tuple[Effect, str, float | None]] = [(effect, effect.name, None) for effect in effects if not effect.time_constant]
+    sets += [(e, f'{e.name}@{k}', float(tau)) for e in effects if e.time_constant for k, tau in enumerate(constants)]
+    base = hand.hand_model.size
+    sizes = [len(effect.amplitudes(effect.components)) for effect, _, _ in sets]
+    ends = np.cumsum([base + 1] + sizes)
+    widths = np.concatenate([1e3 * hand.hand_model.priors, [EARTH_UPWARDS_SD], *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes))])
+    parts = {label: slice(a, b) for (_, label, _), a, b in zip(sets, ends, ends[1:])}
+    space = HandSpace(parts, widths, int(ends[-1]))
+    true, zero = hand.gravity * hand.state.up, np.zeros_like(hand.state.up)
+    at_rest = {sensor: {label: _columns(hand, effect, tau, true, zero, hand.poses.time, hand.poses.temperature_c)[:, :, :size]
+                        for (effect, label, tau), size in zip(sets, sizes) if effect.sensor == sensor} for sensor in SENSORS}
+    blocks = [_norm_block(hand, space, at_rest['accelerometer']), _rest_block(hand, space, at_rest['gyroscope'])]
+    if between := gravity_turns(turns):
+        moving = [effect for effect, _, tau in sets if effect.sensor == 'gyroscope' and tau is None]
+        blocks.append(_turn_block(hand, between, space, at_rest['gyroscope'], moving))
+    return blocks, space
+
+
+def gravity_turns(turns: Sequence[TurnData]) -> list[TurnData]:
+    """Return the turns between poses, with gravity as reference, without those of known angle."""
+    return [turn for turn in turns if turn.rotation is None]
+
+
+def _columns(hand, effect, tau, force, rate, time, temperature_c):
+    """Return the contribution of the effect's parameters to its sensor's output, shape (m, 3, p), at the baseline's solution."""
+    point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
+    names = {sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS}
+    model = HandModel(replace(hand.model, **names, point=point), hand.gravity)
+    values = model.model.start_from(hand.model, hand.values)
+    return model.further(effect.sensor, values, force, rate=rate, time=time, temperature_c=temperature_c)[1]
+
+
+def _natural(poses, sensor):
+    """Return the variance of the usual bias drift, shape (3,)."""
+    return NATURAL**2 * poses.noise[sensor].white_variance * poses.period
+
+
+def _norm_block(hand, space, at_rest):
+    """One row per pose: ``|true force| - gravity``."""
+    poses, count = hand.poses, len(hand.poses.start)
+    residual, base = hand.hand_model.norm_rows(hand.values, poses.force, **poses.conditions)
+    back = base[:, 0:3]
+    rows = np.zeros((count, space.size + 1))
+    rows[:, :base.shape[1]], rows[:, -1] = base, residual
+    for label, columns in at_rest.items():
+        rows[:, space.parts[label]] = np.einsum('ki,kip->kp', back, columns)
+    known = np.sum((back * poses.force_sem)**2, axis=1)
+    floor = known + back**2 @ _natural(poses, 'accelerometer')
+    return Block('poses', 'accelerometer', rows[:, None], known[:, None], floor[:, None], np.arange(count), poses.time)
+
+
+def _rest_block(hand, space, at_rest):
+    """Three rows per pose: the rate at rest, with the Earth's rate about the vertical."""
+    poses, count = hand.poses, len(hand.poses.start)
+    residual, base = hand.rate_rows()
+    rows = np.zeros((count, 3, space.size + 1))
+    rows[:, :, :base.shape[2]], rows[:, :, base.shape[2]], rows[:, :, -1] = base, hand.state.up, residual
+    for label, columns in at_rest.items():
+        rows[:, :, space.parts[label]] = columns
+    known = poses.rate_sem**2
+    floor = known + _natural(poses, 'gyroscope')
+    return Block('poses', 'gyroscope', rows, known, floor, np.arange(count), poses.time)
+
+
+def _turn_block(hand, turns, space, at_rest, moving):
+    """
+    Two rows per turn: the direction after it against the direction before it rotated by the rates, over the turn's duration.
+
+    The bias in a turn is the mean of the rates at rest before and after it, which removes its drift; the contributions of
+    further effects at rest are removed with it. The variance of a row is ``N / T^2 + (s_i^2 + s_j^2) / 4`` with the noise N of the
+    integrated rates, rad^2, the duration T and the standard errors s of the two means.
+    """
+    bias_f, matrix_f = hand.accelerometer
+    matrix = hand.gyroscope[1]
+    across, rows, known, durations = tangent(hand.state.up), [], [], []
+    for turn in turns:
+        i, j = turn.first, turn.last
+        bias = 0.5 * (hand.poses.rate[i] + hand.poses.rate[j])
+        force, rate = np.linalg.solve(matrix_f, (turn.force - bias_f).T).T, np.linalg.solve(matrix, (turn.rate - bias).T).T
+        further = [_columns(hand, e, None, force, rate, turn.time, turn.temperature_c) - 0.5 * (at_rest[e.name][i] + at_rest[e.name][j])
+                   for e in moving]
+        stacked = np.concatenate([np.zeros((len(force), 3, 0)), *further], axis=2)
+        found = integrate_turn(turn.time, turn.rate, bias=bias, matrix=matrix, further=(np.zeros_like(force), stacked))
+        carried = between_middles(hand.poses, turn, found.mat_ji) @ hand.state.up[i]
+        by_psi = across[j].T @ skew(carried) / found.duration
+        row = np.zeros((2, space.size + 1))
+        row[:, hand.hand_model.gyro_matrix] = by_psi @ found.by_matrix.reshape(3, 9)
+        place = 0
+        for effect in moving:
+            row[:, space.parts[effect.name]] = by_psi @ found.by_further[:, place:place + effect.size]
+            place += effect.size
+        row[:, -1] = -across[j].T @ carried / found.duration
+        rows.append(row)
+        durations.append(found.duration)
+        of_bias = 0.25 * np.mean(hand.poses.rate_sem[[i, j]]**2, axis=1).sum()
+        known.append(np.full(2, turn.noise_variance / found.duration**2 + of_bias))
+    return Block('turns', 'gyroscope', np.array(rows), np.array(known), np.array(known), np.array([turn.first for turn in turns]),
+                 np.array([turn.time.mean() for turn in turns]), np.array(durations))
+
 
 POSE_FOLDS = 12
 """Number of folds of the poses; with up to `ONE_BY_ONE` poses each pose is a fold."""
@@ -131,3 +300,106 @@ def _noise(block, used):
     offset, bias, time = min(shapes, key=likelihood.loss)
     unit = likelihood.typical
     return block.known + (offset * unit)**2, (BiasProcess(bias * unit, time),) if bias else ()
+
+
+NORM = 'norm'
+"""Without a table only the component of the accelerometer's error along gravity is observable."""
+TURN_RESIDUAL_UNIT = 'rad/turn'
+"""Unit of the residual of turns: the angle between predicted and measured gravity after a turn."""
+
+
+def unexplained_by_hand(hand: HandCalibration, blocks: Sequence[Block], evidence: HandEvidence, *,
+                        used: Sequence[int], sensor: str) -> Unexplained:
+    """
+    Return the unexplained residual of one sensor: its rows at rest and its turns against the expectation from noise.
+
+    Parameters
+    ----------
+    hand : HandCalibration
+        Of the baseline.
+    blocks : sequence of Block
+        Rows at rest and of turns.
+    evidence : HandEvidence
+        Of these rows.
+    used : sequence of int
+        Parameters of the model.
+    sensor : str
+
+    """
+    residuals, sigma, rms, chosen = evidence.residuals(used), -np.inf, 0.0, None
+    for block, residual in zip(blocks, residuals):
+        if block.sensor != sensor:
+            continue
+        spare = residual.size - np.linalg.matrix_rank(block.rows[:, :, used].reshape(residual.size, -1))
+        if spare < 3:
+            continue
+        own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
+        if block.name == 'poses' or own > max(sigma, SIGNIFICANT_SDS):
+            size = 1.0 if block.duration is None else block.duration[:, None]**2   # the residual of a turn is an angle, of a pose a rate
+            excess = np.sum(residual**2 * size) / spare - np.mean(block.floor * size)
+            if own > sigma:
+                sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block
+    count = len(hand.poses.start)
+    first = next(k for k, block in enumerate(blocks) if block.sensor == sensor)
+    layers, noise_sd = residuals[first], np.sqrt(blocks[first].floor)
+    significant = bool(sigma > SIGNIFICANT_SDS and count >= MIN_EXPLAINED_WINDOWS)
+    unit = None if chosen is None or chosen.duration is None else TURN_RESIDUAL_UNIT
+    if not significant:
+        return Unexplained(False, rms, float(max(sigma, -99.0)), None, 0.0, layers, noise_sd, unit)
+    name, share = correlate(_explanations(hand), layers / noise_sd)
+    if chosen is not None and chosen.name == 'turns' and name is None:
+        name = 'motion (turns between poses)'
+    heldout = evidence.heldout_residuals(used)[first]
+    excess = ((heldout / noise_sd)**2 - 1.0).sum(axis=0)
+    axes = largest_axes(excess) if len(excess) == len(AXES) and excess.max() > 0 else ()
+    return Unexplained(True, rms, float(sigma), name, share, layers, noise_sd, unit,
+                       axes, regimes_by_hand(hand, blocks[first], heldout))
+
+
+def _explanations(hand):
+    poses, up = hand.poses, hand.state.up
+    every = np.ones(len(up), bool)
+    yield from slow_explanations(poses.time, np.full(len(up), np.nan) if poses.temperature_c is None else poses.temperature_c)
+    yield 'direction of gravity', up, every
+    yield 'direction of gravity', np.stack([up[:, 0]**2 - up[:, 1]**2, up[:, 2]**2, up[:, 0] * up[:, 1], up[:, 1] * up[:, 2],
+                                            up[:, 0] * up[:, 2]], axis=1), every
+
+
+def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -> tuple[RestRegime, ...]:
+    """
+    Return the clearest regime of each axis.
+
+    Regimes of larger scatter are not reported, since every other range of few poses has it.
+
+    Parameters
+    ----------
+    hand : HandCalibration
+        Of the baseline.
+    block : Block
+        The sensor's rows in poses.
+    residual : ndarray, shape (k, n_axes)
+        Residual of each pose, by a fit without it.
+
+    """
+    names = AXES if residual.shape[1] == len(AXES) else (NORM,)
+    poses = np.arange(len(residual))
+    exchange = exchanges(poses, np.zeros(len(poses)), np.zeros(len(poses)))
+    search, found = RegimeSearch(block.sensor, block.time, _variables(hand, block), exchange=exchange), []
+    for axis, name in enumerate(names):
+        sd = np.sqrt(block.floor[:, axis])
+        rest = AxisResidual(np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None], np.zeros(1), np.zeros(1))
+        found += search.offsets(name, rest, partial(np.multiply, 1.0 / sd[:, None]), level=REGIME_LEVEL / len(names))[:1]
+    return tuple(found)
+
+
+def _variables(hand: HandCalibration, block: Block) -> list[Variable]:
+    """Return the variables of regimes of poses: the attitude, the previous attitude, the time and the temperature."""
+    force = hand.gravity * hand.state.up
+    before = np.concatenate([force[:1], force[:-1]])
+    of = partial(ranged, starts=np.arange(len(block.time)))
+    found = of('time', block.time, 's')
+    for k, axis in enumerate(AXES):
+        found += of(f'specific force along {axis}', force[block.pose, k], 'm/s^2', least=0.5)
+        found += of(f'specific force along {axis} in the pose before', before[block.pose, k], 'm/s^2', least=0.5)
+    warm = hand.poses.temperature_c
+    return found if warm is None else found + of('temperature', warm[block.pose], 'C', least=0.5)

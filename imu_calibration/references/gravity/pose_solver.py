@@ -8,16 +8,16 @@ from scipy.linalg import solve_triangular
 
 from imu_calibration.core.distributions import chance_of_fall
 from imu_calibration.effects.base import Role
-from imu_calibration.estimation.covariance_terms import GRAVITY, UNMODELLED_EARTH_RATE, total
 from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, ModelError, model_error_of_rows
 from imu_calibration.estimation.row_estimate import MAX_NEWTON_STEPS, RowEstimate, estimate_rows
 from imu_calibration.estimation.scaled_solve import triangular_of_band
+from imu_calibration.estimation.solution import GRAVITY, UNMODELLED_EARTH_RATE, total
 from imu_calibration.estimation.solver import OUTLIER_P_VALUE
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.references.gravity.equations import COMPONENTS, SCATTER_SD, GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.references.gravity.turns import missed_angle
+from imu_calibration.references.gravity.poses import missed_angle
 
 
 def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float) -> tuple[RowEstimate, dict]:

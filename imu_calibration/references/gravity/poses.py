@@ -1,14 +1,18 @@
-"""Poses from samples: means over the intervals held still, and their standard errors."""
+"""Poses and turns from samples: means over the intervals held still, with standard errors, and the readings between them."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from imu_calibration.core.samples import ImuSamples, rounding_variance
+from imu_calibration.core.samples import ImuSamples, rounding_variance, runs_of
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.kinematics.rotations import unit_rows
-from imu_calibration.references.gravity.equations import Poses
+from imu_calibration.kinematics.strapdown import total_rotation
+from imu_calibration.preprocessing.full_scale import LEAST_TURNS, MOST_TURNS, believed_factor
+from imu_calibration.preprocessing.stamping import LAG, MAX_REGULAR_STEP, MOST_LOST, WHOLE_STEP_SHARE
+from imu_calibration.references.gravity.equations import Poses, State, TurnData
+from imu_calibration.references.gravity.hand_parameters import KnownTurn
 
 CREEPS = 3.0
 """Mean square of the slopes of forces across gravity, relative to its expectation from noise, above which poses creep."""
@@ -97,3 +101,204 @@ def distinct_attitudes(force: np.ndarray) -> int:
         if all(np.arccos(np.clip(direction @ other, -1, 1)) > ATTITUDES_APART for other in kept):
             kept.append(direction)
     return len(kept)
+
+
+MAX_RANGE_READINGS = 4000
+"""Largest readings among which the end of the range is searched."""
+TOP = 20
+"""Readings below the largest whose density is estimated."""
+CROWDED = 20.0
+"""The extreme is the end of the range when it has this many times the readings expected by chance."""
+CERTAIN = 1e-3
+"""If fewer readings than this are expected, two equal ones are the end of the range, also neighbours."""
+LINE = 20.0
+"""Duration over which a clock is straight, s: long against the jitter of its stamps, short against the drift of its rate."""
+UNDECIDED = 1.02
+"""Factor by which interpolation errors at even times may exceed those at the stamps, due to noise."""
+TURN_LONGEST = 30.0
+"""Longer stretches between two poses are not used, s: drift and clipping enter."""
+MAX_TURN_GAP = 0.1
+"""A turn with a longer hole in it is not used, s; never below five periods."""
+KNOWN_TURN_SD = 0.017
+"""Accuracy of the angle and of the axis of full turns made by hand, rad."""
+BLOCK = 16384
+"""Samples that are processed together: copies of a long recording are large."""
+SUMMIT = 3
+"""Neighbours in one coarse step at the top of a smooth turn."""
+
+
+def collect_turns(time: np.ndarray, imu: ImuSamples, *, poses: Poses,
+                  temperature_c: np.ndarray | None = None) -> tuple[list[TurnData], dict[str, int]]:
+    """Return (turns between consecutive poses, {reason: count of excluded ones}); `temperature_c` is that of the samples or None."""
+    turns, dropped, rate = [], {}, imu.rate_s
+    limit = max(MAX_TURN_GAP, 5 * poses.period)
+    ended = at_range_end(rate)
+    density = np.mean(poses.noise['gyroscope'].low_variance) * poses.period
+    for first in range(len(poses.start) - 1):
+        piece = slice(poses.stop[first] - 1, poses.start[first + 1] + 1)
+        reason = _unusable(time[piece], ended[piece], limit)
+        if reason:
+            dropped[reason] = dropped.get(reason, 0) + 1
+            continue
+        turns.append(TurnData(time[piece], rate[piece], imu.force_s[piece], first, first + 1, density * (time[piece][-1] - time[piece][0]),
+                              temperature_c=None if temperature_c is None else temperature_c[piece]))
+    return turns, dropped
+
+
+def _unusable(time, ended, gap):
+    if time[-1] - time[0] > TURN_LONGEST:
+        return 'too long'
+    if np.max(np.diff(time)) > gap:
+        return 'gap'
+    return 'clipped' if ended.any() else ''
+
+
+def at_range_end(rate: np.ndarray) -> np.ndarray:
+    """
+    Return which samples are at the end of the gyroscope's range, shape (n,).
+
+    At the end of the range, different motions end at the same reading, on either side and on all axes; without it two readings are
+    hardly ever both the largest, if the converter's step is finer than the distance between the largest readings.
+
+    Parameters
+    ----------
+    rate : array, shape (n, 3)
+        Readings in any unit.
+
+    """
+    fresh = np.ones(len(rate), bool)   # a reading published twice is one reading
+    fresh[1:] = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rate.T])
+    ended = np.zeros(len(rate), bool)
+    for signed, axes in ((np.abs, range(3)), *((signed, [axis]) for axis in range(3) for signed in (np.positive, np.negative))):
+        ended |= _at_end(signed, rate.T[axes], fresh)
+    return ended
+
+
+def _at_end(signed, axes, fresh):
+    """Return the samples at the largest value of ``signed(axes)``, shape (m, n), when that is the end of a range."""
+    some = np.sort(np.concatenate([_largest(signed, axis, fresh) for axis in axes]))[-MAX_RANGE_READINGS:]
+    step = np.diff(some)
+    step = step[step > 1e-9 * np.abs(some[-1])].min(initial=np.inf)
+    margin = 1.5 * step if np.isfinite(step) and len(axes) > 1 else 0.5 * step   # two's complement: one end is larger by a step
+    margin = min(margin, 1e-4 * np.abs(some[-1]))
+    at = np.logical_or.reduce([signed(axis) >= some[-1] - margin for axis in axes])
+    below = some[some < some[-1] - margin][-TOP:]
+    if len(below) < TOP:
+        return np.zeros(len(fresh), bool)
+    chance = TOP * (margin + 0.5 * step) / (some[-1] - below[0]) if np.isfinite(step) else 0.0
+    runs = np.diff(runs_of(at[fresh]))
+    # the top of one smooth turn may fill a coarse step for some samples
+    number = runs.sum() if chance < CERTAIN else np.maximum(runs - SUMMIT, 0).sum() + len(runs)
+    return at if number >= max(2, CROWDED * chance) else np.zeros(len(fresh), bool)
+
+
+def _largest(signed, axis, fresh):
+    """Return the largest values of ``signed(axis[fresh])``, block by block."""
+    largest, least = np.zeros(0), -np.inf
+    for start in range(0, len(axis), BLOCK):
+        values = signed(axis[start:start + BLOCK])
+        largest = np.append(largest, values[(values > least) & fresh[start:start + BLOCK]])
+        if len(largest) > MAX_RANGE_READINGS:
+            largest = np.partition(largest, -MAX_RANGE_READINGS)[-MAX_RANGE_READINGS:]
+            least = largest[0]
+    return largest
+
+
+def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, *, poses: Poses,
+                    temperature_c: np.ndarray | None = None) -> TurnData:
+    """Return the data of a `KnownTurn`; `KNOWN_TURN_SD` applies along and, for the axis, across it."""
+    axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
+    along = np.outer(axis, axis)
+    cov = KNOWN_TURN_SD**2 * along + (turn.angle * KNOWN_TURN_SD)**2 * (np.eye(3) - along)
+    piece = slice(turn.start, turn.stop)
+    density = np.mean(poses.noise['gyroscope'].white_variance) * poses.period
+    noise_variance = density * (time[piece][-1] - time[piece][0])
+    return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=noise_variance, rotation=turn.angle * axis,
+                    rotation_cov=cov, temperature_c=None if temperature_c is None else temperature_c[piece])
+
+
+def sample_times(imu: ImuSamples) -> np.ndarray:
+    """
+    Return the times of samples since the first one, s, shape (n,): of the clock fitted to the stamps, or the stamps.
+
+    An even clock is a straight line through the stamps over the count of the samples, in pieces of `LINE` seconds. It is used unless the
+    readings interpolate better from their neighbours at the stamps, as with a driver that polls the sensor at uneven times.
+    """
+    stamps = rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
+    even, step = stamps.copy(), np.diff(stamps)
+    period = float(np.median(step))
+    edges = np.flatnonzero(step / period > MOST_LOST + MAX_REGULAR_STEP) + 1
+    del step   # a long recording is large
+    for start, stop in zip([0, *edges], [*edges, len(stamps)]):
+        if stop - start >= 2 * LAG:
+            even[start:stop] = _clock_times(stamps[start:stop], period)
+    return even if np.all(np.diff(even) > 0) and _roughness(even, imu.rate_s) <= UNDECIDED * _roughness(stamps, imu.rate_s) else stamps
+
+
+def _clock_times(stamps, period):
+    """Return the times of the clock of one stretch, or its stamps where samples were lost unnoticed."""
+    step, numbers = np.diff(stamps) / period, [np.arange(float(len(stamps)))]
+    lost = (step > MAX_REGULAR_STEP) & (np.abs(step - np.rint(step)) <= WHOLE_STEP_SHARE)
+    if lost.any():   # long steps of a rebuilt clock need not be lost samples
+        numbers.insert(0, np.concatenate([[0.0], np.cumsum(np.where(lost, np.rint(step), 1.0))]))
+    lines = (_clock_line(number, stamps, max(1, int(period * len(stamps) / LINE))) for number in numbers)
+    line = min(lines, key=lambda line: np.sum((stamps - line)**2))
+    part = np.arange(len(stamps) // LAG)
+    size, longer = divmod(len(stamps), len(part))
+    late = np.add.reduceat(stamps - line, part * size + np.minimum(part, longer)) / (size + (part < longer))
+    return line if np.abs(late).max() < 0.6 * period else stamps
+
+
+def _clock_line(number, time, pieces):
+    line = np.polynomial.Polynomial.fit(number, time, 1)(number)
+    means = np.array([[part.mean() for part in np.array_split(values, pieces)] for values in (number, time - line)])
+    return line + np.interp(number, *means)
+
+
+def _roughness(time, rate):
+    """Return the sum of squared errors of linear interpolation between the two neighbours of each reading."""
+    total = 0.0
+    for start in range(0, len(time) - 2, BLOCK):
+        some, own = time[start:start + BLOCK + 2], rate[start:start + BLOCK + 2].T
+        share = (some[1:-1] - some[:-2]) / (some[2:] - some[:-2])
+        total += float(np.sum((own[:, 1:-1] - (1 - share) * own[:, :-2] - share * own[:, 2:])**2))
+    return total
+
+
+def rising(time: np.ndarray) -> np.ndarray:
+    """Spread repeated stamps over the following step: their order is known, their times are not."""
+    if np.all(np.diff(time) > 0):
+        return time
+    kept = np.concatenate([[True], np.diff(time) > 0])
+    return np.interp(np.arange(len(time)), np.flatnonzero(kept), time[kept]) + 1e-9 * np.arange(len(time))
+
+
+def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> float:
+    """
+    Return the factor between measured and true rates, 1 if the rotated gravity matches its observed direction (`preprocessing.full_scale`).
+
+    Only turns with gravity as reference count; the bias of each is the mean of the rates at rest before and after it.
+
+    Parameters
+    ----------
+    state : State
+        Directions of gravity from the norms.
+    poses : Poses
+    turns : sequence of TurnData
+
+    """
+    some = [turn for turn in turns if turn.rotation is None][:MOST_TURNS]
+    if len(some) < LEAST_TURNS:
+        return 1.0
+
+    def missed(factor):
+        return float(np.median([missed_angle(state, poses, turn, matrix=factor * np.eye(3)) for turn in some]))
+
+    return believed_factor(missed)
+
+
+def missed_angle(state: State, poses: Poses, turn: TurnData, *, matrix: np.ndarray) -> float:
+    """Return the angle between rotated and observed gravity after a turn when the gyroscope reads `matrix` times the rate, rad."""
+    bias = 0.5 * (poses.rate[turn.first] + poses.rate[turn.last])
+    mat_ji = total_rotation(turn.time, (turn.rate - bias) @ np.linalg.inv(matrix).T)
+    return float(np.arccos(np.clip(mat_ji @ state.up[turn.first] @ state.up[turn.last], -1.0, 1.0)))

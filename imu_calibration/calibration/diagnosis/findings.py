@@ -1,18 +1,28 @@
-"""Findings as sentences, and motions that separate effects."""
+"""From the result of a search, on a table or by hand, to findings as sentences, their gains, and motions that separate effects."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from imu_calibration.calibration.diagnosis.diagnosis_result import Candidate, Finding, parameters_of
+from imu_calibration.calibration.by_evidence import extended_solution
+from imu_calibration.calibration.diagnosis.applied_gain import gain_by_hand, gain_of_findings
+from imu_calibration.calibration.diagnosis.diagnosis_result import Candidate, Diagnosis, Finding, parameters_of
+from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.document.calibration import beyond_known
-from imu_calibration.effects.base import SENSORS, Effect
+from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.estimation.observability import ALL_MOTIONS, MOTIONS, ONE_JOINT, OTHER_MOUNT, added_information
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.selection.gain import Gain
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.gravity.hand_calibration import HandCalibration
+from imu_calibration.references.gravity.model_selection import HandInvestigation
+from imu_calibration.selection.explained_share import sensors_of
+from imu_calibration.selection.gain import Gain, gain_in_turn
+from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.questions import Question
+from imu_calibration.selection.residual_analysis import ResidualAnalysis
 from imu_calibration.selection.search import FAMILY_WISE, Search
 
 MIN_EVIDENCE_GROWTH = 9.0
@@ -215,3 +225,108 @@ def fitted(search: Search, named: Sequence[Question], question: Question) -> dic
     names = question.effect.param_names()
     return {name: (float(value), float(sd), question.effect.unit_of(k))
             for k, (name, value, sd) in enumerate(zip(names, *search.estimate(named, question)))}
+
+
+MATE = 0.5
+"""Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's reduction."""
+HALF = 0.5
+"""Share of a finding that an unnamed effect would replace, from which it is reported with the finding."""
+
+
+def build_diagnosis(table: Table, found: Investigation, *, calibrated: Solution | None = None) -> Diagnosis:
+    """
+    Return the result of an investigation as a Diagnosis, without traces.
+
+    Parameters
+    ----------
+    table : Table
+        The reference.
+    found : Investigation
+    calibrated : Solution, optional
+        Solution of a model with all findings, with the reported parameters; default: the solution of the investigation.
+
+    """
+    problem, named, limits = found.problem, found.named, found.limits
+    analysis = ResidualAnalysis.of(found, table)
+    rests = analysis.unexplained
+    baseline = extended_solution(problem.space, problem.noise, problem.baseline, chosen=[])
+    solution = extended_solution(problem.space, problem.noise, problem.baseline, chosen=named,
+                                 saturations=limits) if named or limits else baseline
+
+    def gain_of(place):
+        return gain_of_findings(found, table, named[:place], after=named[:place + 1], sensors=sensors_of(named[place].effect))
+
+    def shows(place, mate, gain):
+        if gain.sensor not in sensors_of(mate.effect):
+            return False
+        own, other = (gain_in_turn(problem, named[:place], [*named[:place], each], sensors=[gain.sensor]).reduction
+                      for each in (named[place], mate))
+        return MATE * own <= other
+
+    def motion_of(question, mate):
+        if len(table.joint_names) == 1:
+            return motions_of_one_joint(question, mate)
+        return separating_motion(solution, question, mate, gravity=table.gravity_value)
+
+    told_by = calibrated or solution
+    findings = [_clipping(limit, told_by) for limit in limits]
+    strange = found.implausible
+    findings += [finding(problem.search, named, place, solution=solution if named[place] in strange else told_by,
+                         share=found.explained.share, gain_of=gain_of, motion_of=motion_of,
+                         shows=shows, rivals=_rivals(found, named[place]))
+                 for place in range(len(named))]
+    sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
+    return Diagnosis(tuple(findings), rests, candidates_of(problem.search, named, agree=problem.windows_agree),
+                     tuple(found.not_testable), baseline, solution, gain_of_findings(found, table, [], after=named, sensors=sensors),
+                     len(found.used), int(np.sum(problem.locked)), onset=found.onset, stamp_jitter=analysis.stamp_jitter)
+
+
+def _rivals(found, question):
+    """Return alternatives to a finding that fit nearly as well, and doubtful effects that would replace half of it."""
+    near = [rival.other for rival in found.rivals if rival.question.name == question.name]
+    values = dict(zip(found.problem.space.names, found.problem.values(found.named)))
+    own = [found.problem.space.names[k] for k in question.parameters]
+    for other in found.rejected:
+        moved = found.search.moved_by(found.named, other, found.problem.space.names)
+        near += [other] if any(abs(moved.get(name, 0.0)) > HALF * abs(values[name]) for name in own) else []
+    return near
+
+
+def _clipping(limit, solution):
+    effect = solution.model.find(limit.sensor, Role.LIMIT)
+    parameters = parameters_of(solution, limit.sensor, effect.name)
+    gain = Gain(limit.sensor, 'clipped samples', limit.rms_before, limit.rms_after, (float('nan'), float('nan')), 0)
+    return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, n_clipped=limit.n_clipped), parameters, limit.p_value,
+                   limit.n_expected, 1.0, gain, (), '')
+
+
+def _with_residuals(hand):
+    """Return the HandCalibration with the rms residual of its poses."""
+    residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': hand.rate_rows()[0]}
+    return replace(hand, residual_rms={sensor: np.full(2, np.sqrt(np.mean(residual**2))) for sensor, residual in residuals.items()})
+
+
+def _traces_of(baseline, hand):
+    """Return the `Traces` of two calibrations: one point per pose, the accelerometer's residual along gravity."""
+    poses = hand.poses
+    true = hand.gravity * hand.state.up
+    errors = [{'accelerometer': h.norm_residuals()[:, None] * h.state.up, 'gyroscope': h.rate_rows()[0]} for h in (baseline, hand)]
+    count = len(poses.start)
+    return Traces(poses.time, np.full(count, 'static'), np.zeros((count, 0)), true, np.zeros((count, 3)), poses.temperature_c, errors[0],
+                  errors[1], (poses.stop - poses.start).astype(float), None)
+
+
+def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
+    """Return the result of an investigation as a Diagnosis; `hand` is a calibration with all findings."""
+    problem, named = found.problem, list(found.named)
+    before, after = _with_residuals(found.baseline), _with_residuals(hand)
+
+    def gain_of(place):
+        return gain_by_hand(found, named[:place], after=named[:place + 1], sensor=named[place].sensor)
+
+    findings = tuple(finding(problem.search, named, place, solution=after, share=problem.explained.share, gain_of=gain_of,
+                             motion_of=motions_of) for place in range(len(named)))
+    gain = gain_by_hand(found, [], after=named, sensor=named[0].sensor) if named else None
+    count = len(found.baseline.poses.start)
+    return Diagnosis(findings, found.unexplained, candidates_of(problem.search, named),
+                     tuple(found.not_testable), before, after, gain, count, count if named else 0, _traces_of(found.baseline, hand))
