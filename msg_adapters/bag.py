@@ -13,13 +13,13 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError, did_you_mean, shortened
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
+from msg_adapters.compression import LARGEST_CHUNK, decompress
 from msg_adapters.csv_log import SUFFIXES, CsvBag
 from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, JointDecoder, taken_counts
 from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
 from msg_adapters.layout import Packed, clean_name
-from msg_adapters.mcap_records import LARGEST_CHUNK, decompress
 from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.storage import RawMessages
 from msg_adapters.storages import suffixes

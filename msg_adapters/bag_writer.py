@@ -70,7 +70,7 @@ class BagWriter:
     def close(self) -> None:
         """Finish the files and put the folder in its place."""
         information = self._metadata()
-        self.storage.close(METADATA_VERSION, dump_yaml(information).strip())
+        self.storage.close(information, dump_yaml(information).strip())
         (self.partial / 'metadata.yaml').write_text(dump_yaml({'rosbag2_bagfile_information': information}), encoding='utf-8')
         if self.path.exists():
             self.abort()

@@ -1,173 +1,222 @@
-"""An MCAP file, read and written."""
+"""An MCAP file that is read, and its records."""
 
 import os
 import struct
 import zlib
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from imu_calibration.core.documents import open_regular
-from msg_adapters.definitions import TypeDefinition
-from msg_adapters.layout import Packed, overlapping
-from msg_adapters.mcap_records import (
-    CHANNEL,
-    CHUNK,
-    CHUNK_INDEX,
-    DATA_END,
-    FOOTER,
-    MAGIC,
-    MESSAGE,
-    MESSAGE_INDEX,
-    PREFIX,
-    SCHEMA,
-    STATISTICS,
-    McapDamage,
-    decompress_chunk,
-    indexed_messages,
-    is_record,
-    largest_content,
-    log_times,
-    parse_channel,
-    parse_message_index,
-    parse_schema,
-    parse_statistics,
-    unpack_chunk,
-    walk,
-)
+from msg_adapters.compression import LARGEST_CHUNK, decompress, decompression_errors, largest_content
+from msg_adapters.layout import Packed, clean_name, overlapping
 from msg_adapters.storage import StorageFile, Stretch, read_ahead
 
-CHUNK_SIZE = 1 << 20
-MESSAGE_HEADER = np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-                           ('log_ns', '<u8'), ('publish_ns', '<u8')])
-"""Prefix of the data of a Message record, 31 bytes."""
+MAGIC = b'\x89MCAP0\r\n'
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(0x01, 0x09)
+STATISTICS, DATA_END = 0x0B, 0x0F
+LAST_OPCODE = 0x0F
+PREFIX = struct.Struct('<BQ')
+"""Opcode and length of the content, in front of every record."""
+MESSAGE_PREFIX = PREFIX.size + 22
+"""Bytes of a Message record in front of its data: prefix, channel, sequence, two times."""
+MOST_OTHERS = 1 << 17
+"""Records that are not messages in one buffer; there are at most 65,536 schemas and as many channels."""
+RUN = 8
+"""After so many records of one size, the next ones are searched by stride."""
 
 
-def text(value: bytes | str) -> bytes:
-    """A string with its length in front."""
-    data = value if isinstance(value, bytes) else value.encode()
-    return struct.pack('<I', len(data)) + data
+class Schema(NamedTuple):
+    """A message type and its definition."""
+
+    name: str
+    """Message type."""
+    encoding: str
+    """Language of the definition."""
+    text: str
+    """The definition."""
 
 
-def record(opcode: int, *parts: bytes) -> bytes:
-    """One record: opcode, length, content."""
-    content = b''.join(parts)
-    return struct.pack('<BQ', opcode, len(content)) + content
+class Channel(NamedTuple):
+    """A topic."""
+
+    schema_id: int
+    """Its Schema; 0 for none."""
+    topic: str
+    """Name."""
+    encoding: str
+    """Serialization of the messages."""
 
 
-class McapWriter:
-    """Writes one new file; `compression` of the chunks is '', 'zstd' or 'lz4'."""
-
-    def __init__(self, path: Path, _ros_distro: str, compression: str = ''):
-        self.file = open(path, 'xb')
-        self.compression, self.compress = compression, compressor(compression)
-        self.file.write(MAGIC + record(0x01, text('ros2'), text('imu_calibration')))
-        self.schemas, self.channels = {}, {}
-        self.new_records = b''
-        self.chunk_indexes, self.counts = [], Counter()
-        self.first_ns, self.last_ns = None, 0
-
-    def add_topic(self, topic_id: int, name: str, definition: TypeDefinition, *, qos: str) -> None:
-        """Declare a topic; `definition` is a TypeDefinition."""
-        if definition.type not in self.schemas:
-            schema = record(0x03, struct.pack('<H', len(self.schemas) + 1), text(definition.type), text(definition.encoding),
-                            text(definition.text))
-            self.schemas[definition.type] = (len(self.schemas) + 1, schema)
-            self.new_records += schema
-        metadata = text('offered_qos_profiles') + text(qos) + text('topic_type_hash') + text(definition.digest)
-        channel = record(0x04, struct.pack('<HH', topic_id, self.schemas[definition.type][0]), text(name), text('cdr'), text(metadata))
-        self.channels[topic_id] = channel
-        self.new_records += channel
-
-    def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
-        """Append messages: arrays of topic ids and receive times, and the messages."""
-        headers, head = np.zeros(len(messages), dtype=MESSAGE_HEADER), MESSAGE_HEADER.itemsize
-        headers['opcode'], headers['length'], headers['channel'] = 0x05, messages.size + 22, topic_ids
-        headers['log_ns'] = headers['publish_ns'] = received_ns
-        end = np.cumsum(messages.size + head)
-        place = end - messages.size - head
-        content = np.empty(end[-1], np.uint8)
-        overlapping(content, f'V{head}')[place] = headers.view(f'V{head}')
-        messages.copy_to(content, place + head)
-        cuts = np.flatnonzero(np.diff(end // CHUNK_SIZE)) + 1
-        for first, last in zip([0, *cuts], [*cuts, len(messages)], strict=True):
-            self._write_chunk(headers[first:last], place[first:last] - place[first], content[place[first]:end[last - 1]])
-
-    def _write_chunk(self, headers, offset, messages):
-        content = self.new_records + messages.tobytes()
-        offset += len(self.new_records)
-        self.new_records = b''
-        packed = self.compress(content)
-        times = struct.pack('<QQ', int(headers['log_ns'].min()), int(headers['log_ns'].max()))
-        sizes = text(self.compression) + struct.pack('<Q', len(packed))
-        start = self.file.tell()
-        self.file.write(record(0x06, times, struct.pack('<QI', len(content), zlib.crc32(content)), sizes, packed))
-        length = self.file.tell() - start
-        places = self._write_message_indexes(headers, offset)
-        self.chunk_indexes.append(record(0x08, times, struct.pack('<QQ', start, length), text(places),
-                                         struct.pack('<Q', self.file.tell() - start - length), sizes, struct.pack('<Q', len(content))))
-        self.first_ns = min(int(headers['log_ns'].min()), self.first_ns if self.first_ns is not None else 1 << 63)
-        self.last_ns = max(int(headers['log_ns'].max()), self.last_ns)
-
-    def _write_message_indexes(self, headers, offset):
-        places = b''
-        for channel in np.unique(headers['channel']):
-            mine = headers['channel'] == channel
-            entries = np.stack([headers['log_ns'][mine], offset[mine].astype('<u8')], axis=1)
-            places += struct.pack('<HQ', channel, self.file.tell())
-            self.file.write(record(0x07, struct.pack('<H', channel), text(entries.tobytes())))
-            self.counts[int(channel)] += len(entries)
-        return places
-
-    def close(self, _metadata_version: int, metadata: str) -> None:
-        """Write the metadata, the summary and the footer, and close."""
-        if self.new_records:
-            self.file.write(self.new_records)
-        metadata_start = self.file.tell()
-        content = record(0x0C, text('rosbag2'), text(text('serialized_metadata') + text(metadata)))
-        self.file.write(content + record(0x0F, struct.pack('<I', 0)))
-        counts = b''.join(struct.pack('<HQ', channel, self.counts[channel]) for channel in sorted(self.channels))
-        statistics = struct.pack('<QHIIIIQQ', self.counts.total(), len(self.schemas), len(self.channels), 0, 1, len(self.chunk_indexes),
-                                 self.first_ns or 0, self.last_ns)
-        groups = {0x03: [schema for _, schema in self.schemas.values()], 0x04: list(self.channels.values()), 0x08: self.chunk_indexes,
-                  0x0D: [record(0x0D, struct.pack('<QQ', metadata_start, len(content)), text('rosbag2'))],
-                  0x0B: [record(0x0B, statistics, text(counts))]}
-        summary_start = self.file.tell()
-        offsets = self._write_groups(groups)
-        offset_start = self.file.tell()
-        self.file.write(b''.join(offsets) + record(0x02, struct.pack('<QQI', summary_start, offset_start, 0)) + MAGIC)
-        self.file.close()
-
-    def _write_groups(self, groups):
-        offsets = []
-        for opcode, records in groups.items():
-            start = self.file.tell()
-            self.file.write(b''.join(records))
-            if records:
-                offsets.append(record(0x0E, struct.pack('<BQQ', opcode, start, self.file.tell() - start)))
-        return offsets
-
-    def abort(self) -> None:
-        """Close without finishing."""
-        self.file.close()
+class McapDamage(Exception):
+    """A record that violates the format."""
 
 
-def compressor(name: str) -> Callable | type:
-    """Return the function that compresses a chunk."""
-    if name == 'zstd':
-        from msg_adapters.mcap_records import zstd
-        return zstd().compress
-    if name == 'lz4':
-        from lz4.frame import compress
-        return compress
-    return bytes
+def parse_schema(content: bytes | memoryview) -> tuple[int, Schema]:
+    """Return (id, Schema) from the content of a Schema record."""
+    number, = struct.unpack_from('<H', content)
+    name, encoding, text = _strings(content, 2, 3)
+    return number, Schema(clean_name(name), clean_name(encoding), text.decode(errors='replace'))
+
+
+def parse_channel(content: bytes | memoryview) -> tuple[int, Channel]:
+    """Return (id, Channel) from the content of a Channel record."""
+    number, schema_id = struct.unpack_from('<HH', content)
+    topic, encoding = map(clean_name, _strings(content, 4, 2))
+    return number, Channel(schema_id, topic, encoding)
+
+
+def parse_message_index(content: bytes) -> tuple[int, np.ndarray]:
+    """Return (channel id, offsets of its Message records in the chunk) from a MessageIndex record."""
+    channel, length = struct.unpack_from('<HI', content)
+    entries = np.frombuffer(content, dtype='<u8', count=length // 8, offset=6)
+    return channel, entries[1::2].astype(np.int64)
+
+
+def parse_statistics(content: bytes) -> tuple[int, int, dict[int, int]]:
+    """Return (first time, last time, channel id -> messages) from a Statistics record."""
+    first, last = struct.unpack_from('<QQ', content, 26)
+    return first, last, dict(struct.iter_unpack('<HQ', content[46:46 + struct.unpack_from('<I', content, 42)[0]]))
+
+
+def unpack_chunk(content: memoryview) -> tuple[bytes | memoryview, bool]:
+    """
+    Return the records inside a Chunk record (raises McapDamage).
+
+    Parameters
+    ----------
+    content : buffer
+        Content of the Chunk record, perhaps cut off.
+
+    Returns
+    -------
+    records : bytes-like
+        The records.
+    whole : bool
+        False when the end is missing.
+
+    """
+    try:
+        size, crc, length = struct.unpack_from('<QII', content, 16)
+        compression = bytes(content[32:32 + length]).decode()
+        packed_size, = struct.unpack_from('<Q', content, 32 + length)
+    except (struct.error, UnicodeDecodeError):
+        raise McapDamage('a chunk without its header') from None
+    packed = content[40 + length:40 + length + packed_size]
+    records = packed if compression == '' else _decompressed(compression, packed, size)
+    whole = len(records) == size and len(packed) == packed_size
+    if whole and crc and zlib.crc32(records) != crc:
+        raise McapDamage('a chunk whose checksum does not fit')
+    return records, whole
+
+
+def _decompressed(compression: str, packed: memoryview, size: int) -> bytes:
+    """Return the content of a chunk, at most the `size` bytes that its header declares, or its readable part (raises McapDamage)."""
+    if size > LARGEST_CHUNK:
+        raise McapDamage(f'a chunk of {size} bytes, more than the {LARGEST_CHUNK} that are accepted')
+    try:
+        return decompress(compression, packed, size)
+    except KeyError as error:
+        raise McapDamage(f'a chunk with the unknown compression {compression!r}') from error
+    except decompression_errors() as error:
+        raise McapDamage(f'a chunk that cannot be decompressed ({error})') from error
+
+
+def indexed_messages(buffer: np.ndarray, indexes: Sequence[tuple[float, np.ndarray]]) -> tuple[np.ndarray, Packed] | None:
+    """
+    Find the messages of a chunk by its message indexes.
+
+    Returns
+    -------
+    (channel, messages) : (ndarray, Packed) or None
+        Channel ids, int64, shape (n,), and the messages in file order; None when the indexes do not account for every byte of the chunk
+        (definitions in between, or a wrong index).
+
+    """
+    if not indexes or len(buffer) < MESSAGE_PREFIX:
+        return None
+    offset = np.concatenate([offsets for _, offsets in indexes])
+    channel = np.repeat([number for number, _ in indexes], [len(offsets) for _, offsets in indexes])
+    order = np.argsort(offset, kind='stable')
+    offset, channel = offset[order], channel[order]
+    if not len(offset) or offset[0] < 0 or offset[-1] + MESSAGE_PREFIX > len(buffer):
+        return None
+    length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64)
+    gapless = offset[0] == 0 and np.array_equal(offset + PREFIX.size + length, np.append(offset[1:], len(buffer)))
+    if not gapless or (buffer[offset] != MESSAGE).any() or (overlapping(buffer, '<u2')[offset + PREFIX.size] != channel).any():
+        return None
+    return channel, Packed(buffer, offset + MESSAGE_PREFIX, length - 22)
+
+
+def walk(buffer: np.ndarray) -> tuple[tuple[np.ndarray, Packed], list[tuple[int, bytes]], int]:
+    """
+    Step through records until a chunk, the end, or an incomplete or impossible one; runs of one size are parsed at once.
+
+    Returns
+    -------
+    (channel, messages) : (ndarray, Packed)
+        Channel ids, int64, shape (n,), and the messages in file order.
+    others : list of (opcode, content)
+        Records that are not messages.
+    end : int
+        Where the next record would start.
+
+    """
+    view, offsets, others = buffer.data, [], []
+    position, previous, run, end = 0, -1, 0, len(buffer)
+    while position + PREFIX.size <= end:
+        opcode, length = PREFIX.unpack_from(view, position)
+        behind = position + PREFIX.size + length
+        if not is_record(opcode) or opcode in (CHUNK, DATA_END, FOOTER) or behind > end or (opcode == MESSAGE and length < 22):
+            break
+        if opcode != MESSAGE:
+            if len(others) == MOST_OTHERS:
+                break
+            others.append((opcode, bytes(view[position + PREFIX.size:behind])))
+        else:
+            run = run + 1 if length == previous else 0
+            previous = length
+            offsets.append(np.array([position]) if run < RUN else _run(buffer, position, PREFIX.size + length, 4 * run))
+            run += len(offsets[-1]) - 1
+            behind = int(offsets[-1][-1]) + PREFIX.size + length
+        position = behind
+    offset = np.concatenate(offsets) if offsets else np.zeros(0, np.int64)
+    length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64) if len(offset) else offset
+    channel = overlapping(buffer, '<u2')[offset + PREFIX.size].astype(np.int64) if len(offset) else offset
+    return (channel, Packed(buffer[:position], offset + MESSAGE_PREFIX, length - 22)), others, position
+
+
+def log_times(messages: Packed, index: np.ndarray) -> np.ndarray:
+    """Return the receive times of some messages in their records, int64."""
+    return overlapping(messages.buffer, '<i8')[messages.start[index] - 16]
+
+
+def is_record(opcode: int) -> bool:
+    """Return whether the format defines the opcode, or reserves it for applications."""
+    return 1 <= opcode <= LAST_OPCODE or opcode >= 0x80
+
+
+def _run(buffer, position, stride, reach):
+    """Return offsets of up to `reach` records from `position` on that follow each other with the same opcode and length."""
+    offset = position + stride * np.arange(min((len(buffer) - position) // stride, reach))
+    same = (buffer[offset] == MESSAGE) & (overlapping(buffer, '<u8')[offset + 1] == stride - PREFIX.size)
+    return offset[:len(offset) if same.all() else int(np.argmin(same))]
+
+
+def _strings(content, position, count):
+    texts = []
+    for _ in range(count):
+        length, = struct.unpack_from('<I', content, position)
+        texts.append(bytes(content[position + 4:position + 4 + length]))
+        position += 4 + length
+    return texts
 
 
 FIRST_BYTES = 1 << 16
@@ -280,7 +329,7 @@ class McapFile(StorageFile):
     def _chunk(self, position, length, indexes):
         content = memoryview(self._read(position, length))
         try:
-            records, whole = unpack_chunk(content, decompress_chunk)
+            records, whole = unpack_chunk(content)
             self.n_unpacked += len(records)
             if self.n_unpacked > largest_content(self.size):
                 raise McapDamage('chunks that expand far beyond the size of the file')

@@ -12,9 +12,9 @@ from typing import Any
 from imu_calibration.core import documents
 from imu_calibration.core.documents import open_regular, parsed
 from imu_calibration.core.errors import InputError, shortened
+from msg_adapters.compression import decompress_file, decompress_message
 from msg_adapters.definitions import STANDARD_TYPES, TypeDefinition, is_standard, standard_definition
 from msg_adapters.layout import clean_name
-from msg_adapters.mcap_records import decompress_file, decompress_message
 from msg_adapters.storage import RawMessages
 from msg_adapters.storages import STORAGES, suffixes
 

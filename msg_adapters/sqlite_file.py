@@ -228,10 +228,10 @@ class SqliteWriter:
             self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES ' + ', '.join(['(?, ?, ?)'] * rows),
                                         zip(*[islice(values, 3 * count)] * (3 * rows), strict=True))
 
-    def close(self, metadata_version: int, metadata: str) -> None:
-        """Add the index by time and the metadata, and close."""
+    def close(self, information: dict[str, Any], metadata: str) -> None:
+        """Add the index by time and the metadata as text, and close."""
         self.connection.execute('CREATE INDEX timestamp_idx ON messages (timestamp ASC)')
-        self.connection.execute('INSERT INTO metadata (metadata_version, metadata) VALUES (?, ?)', (metadata_version, metadata))
+        self.connection.execute('INSERT INTO metadata (metadata_version, metadata) VALUES (?, ?)', (information['version'], metadata))
         self.connection.execute('COMMIT')
         self.connection.close()
 

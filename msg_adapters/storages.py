@@ -3,7 +3,8 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-from msg_adapters.mcap_file import McapFile, McapWriter
+from msg_adapters.mcap_file import McapFile
+from msg_adapters.mcap_writer import McapWriter
 from msg_adapters.sqlite_file import SqliteFile, SqliteWriter
 
 

@@ -9,6 +9,7 @@ services: ~/solve, ~/diagnose (at once; the answer comes on /diagnostics), ~/sav
 
 import sys
 import time
+from concurrent.futures import wait
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -172,14 +173,14 @@ class CalibrationNode(Node):
         return live
 
     def _serve(self, what: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        request = self.worker.ask(what)
-        while not request.done.wait(0.005):
+        answer = self.worker.ask(what)
+        while not wait([answer], 0.005).done:
             for each in self._inputs.values():
                 each.drain()
             if not self.worker.is_alive():
                 break
-        response.success, response.message = request.success, request.message
-        say(self.get_logger(), LOG_INFO if request.success else LOG_ERROR, f'~/{what}: {request.message}')
+        response.success, response.message = answer.result() if answer.done() else (False, '')
+        say(self.get_logger(), LOG_INFO if response.success else LOG_ERROR, f'~/{what}: {response.message}')
         self._diagnostics.publish_now()
         return response
 

@@ -8,9 +8,11 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from imu_calibration.calibration.coverage import all_determined
@@ -23,7 +25,7 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.trust import missing
 from imu_calibration.nodes.calibration_status import WorkerState
-from imu_calibration.nodes.diagnosis_thread import DiagnosisThread, Listeners, Request, return_freed_memory
+from imu_calibration.nodes.diagnosis_thread import DiagnosisThread, Listeners, return_freed_memory
 from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.preprocessing.window import WindowSettings
 from msg_adapters.live import LiveGatherer
@@ -186,8 +188,8 @@ class CalibrationWorker(threading.Thread):
         self._pacer, self._watch = SolvePacer(live.settings.solve_share), StreamWatch(live.needs_joints, live.needs_temperature)
         self._diagnosis = DiagnosisThread(self._diagnosis_period)
         self._diagnosed = 0
-        self._asked: list[Request] = []
-        self._lock, self._wake, self._ending = threading.Lock(), threading.Event(), False
+        self._asked: SimpleQueue[tuple[Callable[[], tuple[bool, str]], Future]] = SimpleQueue()
+        self._wake, self._ending = threading.Event(), False
         self._n_solutions, self._new_windows, self._closed = 0, self.live.n_windows > 0, True
         self.place.note_saved(self.live.n_windows)
         self._covered: tuple[int, int, int] | None = None
@@ -206,13 +208,12 @@ class CalibrationWorker(threading.Thread):
     def _diagnosis_period(self) -> float:
         return self.live.settings.diagnosis_period if self.live.on_table is not None else 0.0
 
-    def ask(self, what: str | Callable[[], tuple[bool, str]]) -> 'Request':
-        """Queue 'solve', 'save', 'reset' or a function; return a Request whose `done` is set when the result is available."""
-        request = Request(getattr(self, f'_{what}') if isinstance(what, str) else what)
-        with self._lock:
-            self._asked.append(request)
+    def ask(self, what: str | Callable[[], tuple[bool, str]]) -> Future:
+        """Queue 'solve', 'diagnose', 'save', 'reset' or a function; return the future of its (success, message)."""
+        answer: Future = Future()
+        self._asked.put((getattr(self, f'_{what}') if isinstance(what, str) else what, answer))
         self._wake.set()
-        return request
+        return answer
 
     def end(self, timeout: float = 20.0) -> str:
         """Wait for the end of the present step, save unsaved windows, and return a line about them; '' for no unsaved windows."""
@@ -237,8 +238,8 @@ class CalibrationWorker(threading.Thread):
                     self._survive(step)
             self._survive(self._take)
         finally:
-            for request in self._asked:
-                request.answer(False, 'the node is ending')
+            while not self._asked.empty():
+                self._asked.get()[1].set_result((False, 'the node is ending'))
 
     def _survive(self, step: Callable[[], None]) -> None:
         """Run one step; its error is reported until it succeeds again."""
@@ -267,17 +268,16 @@ class CalibrationWorker(threading.Thread):
                 self.listeners.residuals(residuals)
 
     def _answer(self) -> None:
-        with self._lock:
-            asked, self._asked = self._asked, []
-        for request in asked:
+        while not self._asked.empty():
+            action, answer = self._asked.get()
             try:
-                success, message = request.action()
+                result = action()
             except ImuCalibrationError as error:
-                success, message = False, error.with_hint(self.hints)
+                result = False, error.with_hint(self.hints)
             except Exception as error:   # every request gets a result
-                success, message = False, shortened(f'{type(error).__name__}: {error}', 300)
+                result = False, shortened(f'{type(error).__name__}: {error}', 300)
             self._survive(self._tell)   # the requester reads the diagnostics next
-            request.answer(success, message)
+            answer.set_result(result)
 
     def _solve_when_due(self) -> None:
         idle = not self._closed and self._looked - (self._watch.last_arrival or 0.0) > IDLE
@@ -382,7 +382,6 @@ class CalibrationWorker(threading.Thread):
     def _tell(self) -> None:
         counts = self.live.counts
         self._watch.note_counts(counts, self._looked)
-        self._watch.note_stamping(self.live.stamping)
         result = self.live.result
         verdict, lines = ('', []) if result is None else summary(result, self.hints)
         judged, complete = ('', False) if result is None else (result.verdict.text, result.verdict.complete)
@@ -396,8 +395,8 @@ class CalibrationWorker(threading.Thread):
         found = self._diagnosis.state
         diagnosis = None if self.live.on_table is None else replace(
             found, values={**found.values, 'diagnoses': self._diagnosis.n_answers, 'being made': self._diagnosis.is_running})
-        self.state = WorkerState(groups, self._watch.state(self._looked), self._n_solutions, verdict, tuple(lines), self._trouble,
-                                 tuple(line for line in self._faults.values() if line), self.live.n_windows, values,
+        self.state = WorkerState(groups, self._watch.state(self._looked, self.live.stamping), self._n_solutions, verdict, tuple(lines),
+                                 self._trouble, tuple(line for line in self._faults.values() if line), self.live.n_windows, values,
                                  self.live.status(self.hints), diagnosis, judged, complete)
 
     def _cover(self) -> None:

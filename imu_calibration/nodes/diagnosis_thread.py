@@ -1,4 +1,4 @@
-"""Requests to worker threads, the thread of the diagnosis, and return of unused memory."""
+"""The thread of the diagnosis, receivers of results, and return of unused memory."""
 
 import ctypes
 import threading
@@ -47,19 +47,6 @@ class Listeners:
     """Called with ImuSamples."""
     coverage: Callable[[Any], None] = lambda coverage: None
     """Called with each new Coverage."""
-
-
-class Request:
-    """A request to the worker."""
-
-    def __init__(self, action: Callable[[], tuple[bool, str]]):
-        self.action, self.done = action, threading.Event()
-        self.success, self.message = False, ''
-
-    def answer(self, success: bool, message: str) -> None:
-        """Set the result."""
-        self.success, self.message = success, message
-        self.done.set()
 
 
 MAX_DIAGNOSIS_SHARE = 0.2

@@ -66,7 +66,6 @@ class StreamWatch:
         self._lost, self._recent = Counter(), Counter()
         self._lost_at: float | None = None
         self._apart_since: float | None = None
-        self._stamping: Any = None
         self._unstamped_at: float | None = None
         self._notes: Counter[str] = Counter()
 
@@ -97,10 +96,6 @@ class StreamWatch:
             self._recent, self._lost_at = grown, now
         self._lost = lost
 
-    def note_stamping(self, line: StampLine | None) -> None:
-        """Record the state of the IMU stamps (a StampLine), or None."""
-        self._stamping = line
-
     def _apart_for(self, lead, now):
         """Return the time for which the stamps of the streams have differed, s; in a fast replay they differ briefly."""
         if abs(lead) <= SILENT_AFTER:
@@ -109,17 +104,17 @@ class StreamWatch:
         self._apart_since = now if self._apart_since is None else self._apart_since
         return now - self._apart_since
 
-    def state(self, now: float) -> StreamState:
-        """Return the StreamState at `now`."""
+    def state(self, now: float, stamping: StampLine | None = None) -> StreamState:
+        """Return the StreamState at `now`; `stamping` as its field."""
         values: dict[str, Any] = {f'{name} messages': count for name, count in self._count.items()}
         values |= {f'{name} rate [Hz]': f'{1 / period:.1f}' for name, period in self._period.items()}
         values |= {f'dropped: {reason}': count for reason, count in self._lost.items()}
-        values |= self._notes | ({'imu stamps': str(self._stamping)} if self._stamping else {})
+        values |= self._notes | ({'imu stamps': str(stamping)} if stamping else {})
         silent = tuple(name for name, patience in self._needed.items() if now - self._arrived.get(name, float('-inf')) > patience)
         coming = tuple(name for name in self._arrived if now - self._arrived[name] <= self._needed.get(name, SILENT_AFTER))
         unusable = {name: self._recently(now, MESSAGES[name]) for name in silent}
-        word, text = self._word(silent, now)
-        return StreamState(word, text, values, silent, coming, {name: what for name, what in unusable.items() if what}, self._stamping)
+        word, text = self._word(silent, now, stamping)
+        return StreamState(word, text, values, silent, coming, {name: what for name, what in unusable.items() if what}, stamping)
 
     def _recently(self, now, beginning=''):
         """Return the recently dropped samples for reasons with that beginning; '' if none."""
@@ -127,7 +122,7 @@ class StreamWatch:
             return ''
         return ', '.join(f'{count} {reason}' for reason, count in self._recent.items() if reason.startswith(beginning))
 
-    def _word(self, silent, now):
+    def _word(self, silent, now, stamping):
         """Return the state of the streams and the line that describes it."""
         if silent:
             none = len(silent) == len(self._needed)
@@ -137,8 +132,8 @@ class StreamWatch:
         if self._apart_for(lead, now) > SILENT_AFTER:
             return TROUBLE, (f'the Imu stamps are {abs(lead):.1f} s {"ahead of" if lead > 0 else "behind"} the joint stamps; '
                              'bring the clocks together')
-        if self._stamping is not None and self._stamping.word == IRREGULAR:
-            return TROUBLE, f"{self._stamping}: sampling times are unknown; the driver should stamp by the sensor's clock"
+        if stamping is not None and stamping.word == IRREGULAR:
+            return TROUBLE, f"{stamping}: sampling times are unknown; the driver should stamp by the sensor's clock"
         if self._unstamped_at is not None and now - self._unstamped_at < RECENT_SECONDS:
             notes = ', '.join(f'{count} {reason}' for reason, count in self._notes.items())
             return TROUBLE, f'{notes}: the driver sets none, the time of arrival is used'

@@ -243,7 +243,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, storage):
 
 
 def test_what_was_decompressed_is_removed_on_sigterm(tmp_path):
-    from msg_adapters.mcap_records import zstd
+    from msg_adapters.compression import zstd
     bag, temporary = write_small_bag(tmp_path / 'bag'), tmp_path / 'temporary'
     temporary.mkdir()
     database = next(bag.glob('*.db3'))

@@ -16,8 +16,8 @@ from test_adapters_bag import make_session
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
+from msg_adapters.compression import zstd
 from msg_adapters.definitions import standard_definition
-from msg_adapters.mcap_records import zstd
 from msg_adapters.sqlite_file import PAGE_SIZE
 from msg_adapters.write import encode_imu, encode_joints, write_session
 

@@ -13,8 +13,8 @@ from msg_adapters.bag import open_recording
 from msg_adapters.definitions import standard_definition
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
-from msg_adapters.mcap_file import MAGIC, record, text
-from msg_adapters.mcap_records import indexed_messages, walk
+from msg_adapters.mcap_file import MAGIC, indexed_messages, walk
+from msg_adapters.mcap_writer import record, text
 from msg_adapters.write import encode_imu, encode_joints
 
 

@@ -37,7 +37,7 @@ class LinesWriter:
         for topic_id, received, data in zip(topic_ids.tolist(), received_ns.tolist(), messages.views(), strict=True):
             print(json.dumps(['message', topic_id, received, b64encode(data).decode()]), file=self.file)
 
-    def close(self, _metadata_version, _metadata):
+    def close(self, _information, _metadata):
         """Close."""
         self.file.close()
 

@@ -15,11 +15,11 @@ from test_adapters_mcap import chunk, message, record, text, write_file
 from imu_calibration.core.documents import parsed
 from imu_calibration.core.errors import InputError
 from msg_adapters.bag import list_topics
+from msg_adapters.compression import LARGEST_CHUNK, decompress_message, zstd
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.definitions import deserializer, is_standard
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed
-from msg_adapters.mcap_records import LARGEST_CHUNK, decompress_message, zstd
 from msg_adapters.rosbag2 import spelled_out
 from msg_adapters.write import encode_imu, encode_joints
 

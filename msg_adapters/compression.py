@@ -1,0 +1,117 @@
+"""Compressed chunks, messages and files, decompressed within limits."""
+
+import bz2
+import shutil
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+PACKED_PIECE_BYTES = 1 << 20
+LARGEST_CHUNK, LARGEST_MESSAGE = 64 << 20, 32 << 20
+"""Bytes of a chunk and of a message when decompressed; recorders write chunks of a few megabytes."""
+MESSAGE_BASE = 4 << 20
+"""A message may grow to this many bytes, plus `FILE_RATIO` times its compressed size; each of many may be a bomb."""
+MOST_FRAMES = 10_000
+"""Frames of one stream; each costs time and gives at least a megabyte in files that compress in parallel."""
+FILE_BASE, FILE_RATIO = 256 << 20, 100
+"""A file may grow to this many bytes, plus this many times its compressed size; recordings of sensors shrink by a factor of ten at most."""
+
+
+@cache
+def zstd() -> ModuleType:
+    """Return the zstd module: of the standard library where available, otherwise of the package that rosbags requires."""
+    if sys.version_info >= (3, 14):
+        from compression import zstd as module
+    else:
+        from backports import zstd as module
+    return module
+
+
+def decompress(compression: str, packed: bytes | memoryview, limit: int) -> bytes:
+    """
+    Return at most `limit` bytes of a stream: zstd, lz4 or bz2.
+
+    Raises
+    ------
+    KeyError
+        For another compression; `decompression_errors` for damaged data.
+
+    """
+    make, parts, n_bytes = _decompressor(compression), [], 0
+    for _ in range(MOST_FRAMES):
+        decompressor = make()
+        parts.append(decompressor.decompress(packed, limit - n_bytes))
+        n_bytes += len(parts[-1])
+        packed = decompressor.unused_data if decompressor.eof else b''
+        if not packed or n_bytes >= limit:
+            break
+    return parts[0] if len(parts) == 1 else b''.join(parts)
+
+
+def _decompressor(compression: str) -> Callable[[], Any]:
+    if compression == 'lz4':
+        from lz4 import frame
+        return frame.LZ4FrameDecompressor
+    return {'zstd': zstd().ZstdDecompressor, 'bz2': bz2.BZ2Decompressor}[compression]
+
+
+def decompression_errors() -> tuple[type[Exception], ...]:
+    """Return the errors of `decompress` for damaged data."""
+    return zstd().ZstdError, RuntimeError, EOFError, OSError, ValueError
+
+
+def decompress_message(data: bytes) -> bytes:
+    """Return one message of a bag that is compressed by message (raises ValueError for one that expands too much)."""
+    limit = min(LARGEST_MESSAGE, MESSAGE_BASE + FILE_RATIO * len(data))
+    plain = decompress('zstd', data, limit)
+    if len(plain) == limit:
+        raise ValueError('a message expands beyond its limit')
+    return plain
+
+
+def largest_content(file_size: int) -> int:
+    """Return how many bytes a compressed file of a size may contain."""
+    return FILE_BASE + FILE_RATIO * file_size
+
+
+def decompress_file(source: Path, target: Path) -> str | None:
+    """
+    Decompress a zstd file into another; return the error that ended it early, or None.
+
+    Data decompressed before the damage are written in any case.
+
+    Raises
+    ------
+    ValueError
+        When it is much larger than a recording would be, or than the free space.
+
+    """
+    module, source = zstd(), Path(source)
+    limit = min(largest_content(source.stat().st_size), shutil.disk_usage(target.parent).free * 9 // 10)
+    with source.open('rb') as packed, Path(target).open('wb') as plain:
+        decompressor, n_frames, data, started = module.ZstdDecompressor(), 0, b'', True
+        try:
+            while data or not decompressor.needs_input or (data := packed.read(PACKED_PIECE_BYTES)):
+                plain.write(decompressor.decompress(data, PACKED_PIECE_BYTES))
+                data, started = b'', True
+                if decompressor.eof:   # a file may hold several frames
+                    data, decompressor, n_frames = decompressor.unused_data, module.ZstdDecompressor(), n_frames + 1
+                    started = bool(data)
+                if plain.tell() > limit or n_frames > MOST_FRAMES:
+                    raise ValueError(f'it expands beyond the {limit} bytes or {MOST_FRAMES} frames that are accepted')
+        except module.ZstdError as error:
+            return str(error)
+    return 'the stream is cut off' if started else None
+
+
+def compressor(name: str) -> Callable | type:
+    """Return the function that compresses a chunk."""
+    if name == 'zstd':
+        return zstd().compress
+    if name == 'lz4':
+        from lz4.frame import compress
+        return compress
+    return bytes
