@@ -167,7 +167,7 @@ class SimulatorNode(Node):
         if 'imu/temperature' in self._to:
             parts.append((self._to['imu/temperature'], block.temperature, encode_temperature))
         if 'imu/truth' in self._to:
-            parts.append((self._to['imu/truth'], block.truth, encode_imu))
+            parts.append((self._to['imu/truth'], self._simulation.truth(block), encode_imu))
         due = np.concatenate([(samples.stamp_ns - self._simulation.start_ns) * 1e-9 for _, samples, _ in parts])
         publishers = [publisher for publisher, samples, _ in parts for _ in range(len(samples))]
         messages = [message for _, samples, encode in parts if len(samples) for message in Packed.of_rows(encode(samples)).views()]

@@ -142,8 +142,8 @@ class SimulatedBlock:
     """Joint states."""
     temperature: TemperatureSamples | None
     """Temperatures, when the simulation has them."""
-    truth: ImuSamples
-    """True specific force and rate at the origin of the arms, at the stamps of `imu`."""
+    imu_time: np.ndarray
+    """Times of `imu`, s, without errors of the stamps, shape (n,)."""
 
 
 class LiveSimulation:
@@ -193,41 +193,47 @@ class LiveSimulation:
 
     def at(self, imu_time: np.ndarray, joint_time: np.ndarray, temperature_time: np.ndarray) -> SimulatedBlock:
         """Return the samples at the times of each stream, s."""
-        imu, truth = self._imu(imu_time)
+        imu = self._imu(imu_time)
         motion, warmth = self.motion.at(joint_time), temperature_at(temperature_time, self.options)
         position = read_encoders(motion.position, self.options.noise, self._rng)
         velocity = motion.rate if self.options.with_velocity else np.full_like(motion.rate, np.nan)
         joints = JointSamples(self._stamps(motion.time), position, velocity, tuple(self.table.joint_names))
-        return SimulatedBlock(imu, joints, None if warmth is None else TemperatureSamples(self._stamps(temperature_time), warmth), truth)
+        return SimulatedBlock(imu, joints, None if warmth is None else TemperatureSamples(self._stamps(temperature_time), warmth), imu_time)
 
     def _stamps(self, time):
         return self.start_ns + np.round(time * 1e9).astype(np.int64)
 
     def _imu(self, time):
         if not len(time):
-            empty = ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), self.options.frame_id)
-            return empty, empty
-        parts = zip(*(self._felt(time[k:k + SIMULATED_BLOCK_SAMPLES]) for k in range(0, len(time), SIMULATED_BLOCK_SAMPLES)))
-        felt = Felt(*map(np.concatenate, parts))
-        noisy = self._noise.add(felt.force, felt.rate)
+            return ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), self.options.frame_id)
+        parts = zip(*(self._outputs(time[k:k + SIMULATED_BLOCK_SAMPLES]) for k in range(0, len(time), SIMULATED_BLOCK_SAMPLES)))
+        noisy = self._noise.add(*map(np.concatenate, parts))
         force, rate = (clip(self.model, sensor, self.values, output=output) for sensor, output in zip(SENSORS, noisy))
         stamps = jitter_stamps(self._stamps(time), self.options.noise.stamp_jitter, self._rng)
-        return (ImuSamples(stamps, force, rate, self.options.frame_id),
-                ImuSamples(stamps, felt.true_force, felt.true_rate, self.options.frame_id))
+        return ImuSamples(stamps, force, rate, self.options.frame_id)
 
-    def _felt(self, time):
-        """Return true motion and outputs of the sensors without noise."""
-        motion = self.motion.at(time)
-        references = References(self.model, self.table, motion)
+    def _outputs(self, time):
+        """Return the outputs of the sensors without noise, each (n, 3)."""
+        outputs = answered(self.model, self.values, self.table, motion=self.motion.at(time), time=time, options=self.options)
+        if not self.causes:
+            return outputs
+        felt = Felt(*self._true_motion(time), *outputs)
+        for cause in self.causes:
+            felt = cause(felt)
+        return felt.force, felt.rate
+
+    def truth(self, block: SimulatedBlock) -> ImuSamples:
+        """Return true specific force and rate at the origin of the arms, at the stamps of `block.imu`."""
+        return ImuSamples(block.imu.stamp_ns, *self._true_motion(block.imu_time), self.options.frame_id)
+
+    def _true_motion(self, time):
+        """Return true specific force and rate, each (n, 3)."""
+        references = References(self.model, self.table, self.motion.at(time))
         accelerometer, gyroscope = (references.at(sensor) for sensor in SENSORS)
         true_force, arm = accelerometer.force_s, self.model.value('accelerometer', Role.ARM, self.values)
         if arm is not None:
             true_force = true_force + lever_matrix(accelerometer.rate_s, accelerometer.alpha_s) @ arm
-        felt = Felt(true_force, gyroscope.rate_s, *answered(self.model, self.values, self.table, motion=motion, time=time,
-                                                            options=self.options))
-        for cause in self.causes:
-            felt = cause(felt)
-        return felt
+        return true_force, gyroscope.rate_s
 
 
 def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: Profile, options: SimulationOptions = SimulationOptions(),
