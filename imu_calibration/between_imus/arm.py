@@ -7,14 +7,7 @@ import numpy as np
 import scipy.linalg
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.between_imus.pair import (
-    PairedImu,
-    make_windows,
-    relative_rotation,
-    require_overlap,
-    window_centres,
-    window_length,
-)
+from imu_calibration.between_imus.pair import PairedImu, make_windows, relative_rotation, require_overlap, window_centres, window_length
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.sensor_model import linear_names

@@ -1,7 +1,7 @@
 """Coverage of directions by a calibration, and the state of each effect."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -120,14 +120,13 @@ class Coverage:
     frame_id: str = ''
     """Frame of the sensor."""
 
+    def with_done(self, groups: Sequence[GroupState]) -> 'Coverage':
+        """Return the coverage that is done where every group is determined; never without groups."""
+        return replace(self, done=bool(groups) and all(group.status == DETERMINED for group in groups))
+
 
 NOTHING_SEEN = Coverage(np.ones(len(DIRECTIONS)), np.zeros((0, 3)), None, Step('move the table'), float('nan'))
 """Before anything is known."""
-
-
-def all_determined(groups: Sequence[GroupState]) -> bool:
-    """Return whether every group is determined; False without groups."""
-    return bool(groups) and all(group.status == DETERMINED for group in groups)
 
 
 def excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
@@ -253,9 +252,15 @@ def arrows_of(coverage: Coverage) -> Iterator[tuple[str, np.ndarray, np.ndarray,
             yield 'arms', centre, ARMS_TIMES * arm, tuple(colour)
 
 
-def line_of(coverage: Coverage) -> str:
-    """Return the line of text next to the sphere."""
-    if coverage.done:
-        return 'all parameters are determined: save the calibration'
-    what = coverage.next.text or 'go on'
-    return what + ('' if np.isnan(coverage.seconds) or not coverage.seconds else f', about {coverage.seconds:.0f} s left')
+def seen_of(coverage: Coverage) -> tuple[np.ndarray, tuple[float, ...], float]:
+    """Return (places, colour, diameter) of the earlier up directions."""
+    return 1.1 * RADIUS * coverage.seen, VISITED, SEEN_DIAMETER
+
+
+def label_of(coverage: Coverage) -> tuple[np.ndarray, tuple[float, ...], str]:
+    """Return (place, colour, line of text) of the label above the sphere."""
+    colour, line = DONE_COLOUR, 'all parameters are determined: save the calibration'
+    if not coverage.done:
+        left = '' if np.isnan(coverage.seconds) or not coverage.seconds else f', about {coverage.seconds:.0f} s left'
+        colour, line = TEXT_COLOUR, (coverage.next.text or 'go on') + left
+    return np.array([0.0, 0.0, 1.6 * RADIUS]), colour, line

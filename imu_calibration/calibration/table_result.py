@@ -17,13 +17,7 @@ from imu_calibration.calibration.proof import nominal_values
 from imu_calibration.calibration.result import GRAVITY_SD, CalibrationResult, ErrorBudget, WindowErrors
 from imu_calibration.core.units import ARCMIN
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.forward_equations import (
-    References,
-    coefficient_jacobian,
-    coefficients,
-    columns,
-    sensor_output,
-)
+from imu_calibration.effects.forward_equations import References, coefficient_jacobian, coefficients, columns, sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.observability import tolerance_scaled_singular_values

@@ -11,19 +11,7 @@ from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from imu_calibration.calibration.coverage import (
-    ARROW,
-    DONE_COLOUR,
-    RADIUS,
-    SEEN_DIAMETER,
-    TEXT_COLOUR,
-    VISITED,
-    Coverage,
-    GroupState,
-    arrows_of,
-    cells_of,
-    line_of,
-)
+from imu_calibration.calibration.coverage import ARROW, RADIUS, TEXT_COLOUR, Coverage, GroupState, arrows_of, cells_of, label_of, seen_of
 from imu_calibration.calibration.diagnosis import live_diagnosis as diagnosis
 from imu_calibration.core.progress import LiveState
 from imu_calibration.document.decision import HARMS
@@ -194,16 +182,17 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     made = [Marker(ns='all', action=Marker.DELETEALL)]
     made += [_marker('cells', k, Marker.SPHERE, color=(*color, 0.9), scale=(size,) * 3, place=place)
              for k, (place, color, size) in enumerate(cells_of(coverage))]
-    if len(coverage.seen):
-        made.append(_marker('seen', 0, Marker.SPHERE_LIST, color=VISITED, scale=(SEEN_DIAMETER,) * 3, points=1.1 * RADIUS * coverage.seen))
+    seen, color, diameter = seen_of(coverage)
+    if len(seen):
+        made.append(_marker('seen', 0, Marker.SPHERE_LIST, color=color, scale=(diameter,) * 3, points=seen))
     made += [_arrow(*each, number=k) for k, each in enumerate(arrows_of(coverage))]
     step = coverage.next
     if step.axis is not None and coverage.up is not None and step.up is not None:
         across, angles = np.cross(step.axis, coverage.up), np.linspace(0, step.angle, 24)[:, None]
         made.append(_marker('turn', 0, Marker.LINE_STRIP, color=(*ARROW, 0.7), scale=(0.012, 0.0, 0.0),
                             points=0.7 * RADIUS * (np.cos(angles) * coverage.up - np.sin(angles) * across)))
-    made.append(_marker('text', 0, Marker.TEXT_VIEW_FACING, color=DONE_COLOUR if coverage.done else TEXT_COLOUR, scale=(0.0, 0.0, 0.09),
-                        place=(0.0, 0.0, 1.6 * RADIUS), text=line_of(coverage)))
+    place, color, line = label_of(coverage)
+    made.append(_marker('text', 0, Marker.TEXT_VIEW_FACING, color=color, scale=(0.0, 0.0, 0.09), place=place, text=line))
     return _stamped(made, coverage.frame_id, stamp)
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from imu_calibration.calibration.coverage import all_determined
 from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
 from imu_calibration.calibration.live import LiveByHandSettings, LiveCalibration, LiveSettings, SolvePacer
 from imu_calibration.calibration.live_poses import LiveByHand
@@ -404,4 +403,4 @@ class CalibrationWorker(threading.Thread):
         seen = (id(self.live), self.live.n_windows if self.live.on_table is None else 0, self._n_solutions)
         if seen != self._covered:
             self._covered = seen
-            self.listeners.coverage(replace(self.live.coverage(), done=all_determined(self.state.groups)))
+            self.listeners.coverage(self.live.coverage().with_done(self.state.groups))

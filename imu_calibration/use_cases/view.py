@@ -11,19 +11,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from imu_calibration.calibration.coverage import (
-    RADIUS,
-    SEEN_DIAMETER,
-    TEXT_COLOUR,
-    VISITED,
-    Coverage,
-    all_determined,
-    arrows_of,
-    cells_of,
-    group_states,
-    line_of,
-    table_coverage,
-)
+from imu_calibration.calibration.coverage import Coverage, arrows_of, cells_of, group_states, label_of, seen_of, table_coverage
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.calibration.hand_workflow import HandResult
 from imu_calibration.calibration.pose_scan import EMPTY_SCAN, hand_coverage
@@ -205,11 +193,11 @@ def scene_of(coverage: Coverage, frame_id: str) -> Any:
         return found.ArrowPrimitive(pose=pose(start, _from_x(along / length)), shaft_length=0.8 * length, shaft_diameter=0.025,
                                     head_length=0.2 * length, head_diameter=0.05, color=color(rgb))
 
-    balls = [ball(*cell) for cell in cells_of(coverage)] + [ball(1.1 * RADIUS * up, VISITED, SEEN_DIAMETER) for up in coverage.seen]
+    (seen, of_seen, diameter), (above, of_line, line) = seen_of(coverage), label_of(coverage)
+    balls = [ball(*cell) for cell in cells_of(coverage)] + [ball(place, of_seen, diameter) for place in seen]
     arrows = [arrow(start, end - start, rgb) for _, start, end, rgb in arrows_of(coverage)]
-    line = found.TextPrimitive(pose=pose((0.0, 0.0, 1.6 * RADIUS)), billboard=True, font_size=0.09, color=color(TEXT_COLOUR),
-                               text=line_of(coverage))
-    entity = found.SceneEntity(timestamp=found.Timestamp(0), frame_id=frame_id, id='coverage', spheres=balls, arrows=arrows, texts=[line])
+    text = found.TextPrimitive(pose=pose(above), billboard=True, font_size=0.09, color=color(of_line), text=line)
+    entity = found.SceneEntity(timestamp=found.Timestamp(0), frame_id=frame_id, id='coverage', spheres=balls, arrows=arrows, texts=[text])
     return found.SceneUpdate(entities=[entity])
 
 
@@ -349,4 +337,4 @@ def _coverage(result: CalibrationResult) -> Coverage:
     else:
         assert isinstance(result, TableResult), 'a calibration is made by hand or on a table'
         found = table_coverage(result)
-    return replace(found, done=all_determined(group_states(result)))
+    return found.with_done(group_states(result))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.advice import WEIGHTS, HandStep, _rollout, direction_words, foretold, shortest_turn
-from imu_calibration.calibration.coverage import DIRECTIONS, MIN_CELL_WORTH, Coverage, Step, line_of, table_coverage
+from imu_calibration.calibration.coverage import DIRECTIONS, MIN_CELL_WORTH, Coverage, Step, label_of, table_coverage
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
 from imu_calibration.calibration.live_poses import LiveByHand
 from imu_calibration.calibration.pose_scan import EMPTY_SCAN, hand_coverage, knowledge_of
@@ -150,7 +150,7 @@ def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
     live, result = begun
     shown, solution = live.coverage(), result.solution
     assert result.needed and 0 < shown.seconds < 600 and shown.next.text in {motion.text for motion in MOTIONS}
-    assert line_of(shown) == f'{shown.next.text}, about {shown.seconds:.0f} s left'
+    assert label_of(shown)[2] == f'{shown.next.text}, about {shown.seconds:.0f} s left'
     lengths, prior, first = {motion.text: motion.seconds for motion in MOTIONS}, make_prior(solution.model), shown.next.text
     if shown.seconds == pytest.approx(lengths[first]):
         [motion] = [motion for motion in MOTIONS if motion.text == first]
@@ -164,7 +164,7 @@ def test_a_table_with_one_joint_is_told_no_seconds_of_motions_that_it_cannot_do(
     live, result = begun
     monkeypatch.setattr('imu_calibration.calibration.coverage.possible_motions', lambda table: motions_about([0.6, 0.0, 0.8], [0.0, 0.0, 1.0]))
     shown = table_coverage(result)
-    assert np.isnan(shown.seconds) and shown.next.text and 'left' not in line_of(shown)
+    assert np.isnan(shown.seconds) and shown.next.text and 'left' not in label_of(shown)[2]
 
 
 rclpy = pytest.importorskip('rclpy')
@@ -200,7 +200,7 @@ def test_markers_carry_frame_cells_arrow_and_time():
 def test_when_all_is_done_every_cell_is_green_and_the_text_says_so():
     done = Coverage(np.zeros(26), np.eye(3), np.eye(3)[0], Step(''), 0.0, True, 0.01 * np.eye(3))
     made = picture(done)
-    assert made['text'][0].text == line_of(done) and 'next' not in made and len(made['arms']) == 3
+    assert made['text'][0].text == label_of(done)[2] and 'next' not in made and len(made['arms']) == 3
     assert len({(m.color.r, m.color.g, m.scale.x) for m in made['cells']}) == 1 and made['cells'][0].color.g > made['cells'][0].color.r
 
 

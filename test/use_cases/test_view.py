@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.coverage import line_of
+from imu_calibration.calibration.coverage import label_of
 from imu_calibration.cli.main import main
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.calibration import UNKNOWN_SD
@@ -100,7 +100,7 @@ def test_parameters_have_value_band_and_tolerance(written, result):
 def test_the_sphere_says_what_is_next_and_shows_every_cell_and_rest(written, result):
     scene, found = shown_of(written, SPHERE_TOPIC), _coverage(result)
     drawn = str(scene_of(found, 'imu_link'))
-    assert scene == scene_of(found, result.calibration.frame_id).encode() and line_of(found).encode() in scene
+    assert scene == scene_of(found, result.calibration.frame_id).encode() and label_of(found)[2].encode() in scene
     assert drawn.count('SpherePrimitive') == 26 + (result.window_errors().kind == 'static').sum()
 
 
