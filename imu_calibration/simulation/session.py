@@ -224,7 +224,8 @@ class LiveSimulation:
 
     def truth(self, block: SimulatedBlock) -> ImuSamples:
         """Return true specific force and rate at the origin of the arms, at the stamps of `block.imu`."""
-        return ImuSamples(block.imu.stamp_ns, *self._true_motion(block.imu_time), self.options.frame_id)
+        force, rate = self._true_motion(block.imu_time)
+        return ImuSamples(block.imu.stamp_ns, force, rate, self.options.frame_id)
 
     def _true_motion(self, time):
         """Return true specific force and rate, each (n, 3)."""
