@@ -74,7 +74,7 @@ def judged(truth, moments):
         term = found.alternatives.get(name) or found.terms.get(name)
         figures.append((name, value, *((term.interval[0], term.interval[1], term.status) if term else (None, None, 'not asked'))))
     names = [name for name in ('quantisation', 'white_noise', *truth.form) if name in truth.figures]
-    fit = fit_form(moments, truth.form, tuple(name for name in names if name == 'quantisation')).fit
+    fit = fit_form(moments, truth.form, tuple(name for name in names if name == 'quantisation'))
     true, values = coefficients(truth, names), dict(zip(names, fit.coefficients))
     if 'gauss_markov' in names:
         values[TIME_KEY] = fit.processes[-1].time

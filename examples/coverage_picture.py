@@ -10,7 +10,7 @@ from visualization_msgs.msg import Marker
 
 from imu_calibration.calibration.advice import HandStep, foretold
 from imu_calibration.calibration.coverage import DIRECTIONS, Coverage, Step
-from imu_calibration.calibration.pose_scan import EMPTY_SCAN, knowledge_of
+from imu_calibration.calibration.live_poses import EMPTY_SCAN, knowledge_of
 from imu_calibration.nodes.calibration_status import markers_of
 from imu_calibration.references.gravity.hand_parameters import HandOptions
 

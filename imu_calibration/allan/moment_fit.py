@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg.lapack import dtrtri
 from scipy.special import gammainc, gammaincc, ndtr
 
-from imu_calibration.allan.processes import NoiseProcess, ScaleCovariance, gauss_markov
+from imu_calibration.allan.processes import QUANTISATION, WHITE, NoiseProcess, ScaleCovariance, gauss_markov
 from imu_calibration.allan.trends import KeptShare, Parts
 
 MAX_WEIGHT_ROUNDS = 25
@@ -36,6 +36,14 @@ class MomentFit:
     """Covariance of the variances at the fitted model, shape (n_scales, n_scales)."""
     misfit: float
     """Weighted sum of squares."""
+
+    cost: float = np.inf
+    """Cost among the forms (`terms.fit_form`); infinite where forms were not compared."""
+
+    @property
+    def form(self) -> tuple[str, ...]:
+        """Names of the slow processes."""
+        return tuple(name for name in self.names if name not in (QUANTISATION.name, WHITE.name))
 
     @property
     def names(self) -> tuple[str, ...]:

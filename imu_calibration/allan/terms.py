@@ -38,35 +38,23 @@ QUANTISATION_P_VALUE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class ModelFit:
-    """One form fitted to one axis."""
-
-    form: tuple[str, ...]
-    """Names of the slow processes."""
-    fit: MomentFit
-    """Coefficients."""
-    cost: float
-    """Minus twice the log likelihood, and the penalty of the parameters."""
-
-
-@dataclass(frozen=True, eq=False)
 class Choice:
     """The forms of one axis, the best first."""
 
-    fits: tuple[ModelFit, ...]
+    fits: tuple[MomentFit, ...]
     """All forms in order of their cost."""
     moments: Moments
     """Data of the fit."""
 
     @property
-    def best(self) -> ModelFit:
+    def best(self) -> MomentFit:
         """The selected form."""
         return self.fits[0]
 
     @property
-    def rivals(self) -> tuple[ModelFit, ...]:
+    def rivals(self) -> tuple[MomentFit, ...]:
         """Other forms that explain the curve nearly as well, except supersets of a form named before."""
-        found: list[ModelFit] = []
+        found: list[MomentFit] = []
         for fit in self.fits:
             if fit.cost - self.best.cost <= MAX_COST_EXCESS and not any(_is_part(known.form, fit.form) for known in (self.best, *found)):
                 found.append(fit)
@@ -74,18 +62,17 @@ class Choice:
 
     def having(self, name: str) -> tuple[list[MomentFit], list[float]]:
         """Return the fits with a process, the best first, and the likelihood of each relative to it; negligible ones are omitted."""
-        found = [fit for fit in self.fits if name in fit.fit.names]
+        found = [fit for fit in self.fits if name in fit.names]
         weights = [1.0, *(float(np.exp(-0.5 * (fit.cost - found[0].cost))) for fit in found[1:])]
-        return [fit.fit for fit, weight in zip(found, weights) if weight > MIN_FORM_WEIGHT], [w for w in weights if w > MIN_FORM_WEIGHT]
+        return [fit for fit, weight in zip(found, weights) if weight > MIN_FORM_WEIGHT], [w for w in weights if w > MIN_FORM_WEIGHT]
 
     def widened(self, name: str) -> 'Choice':
         """Return a choice of one: the best form with a further process."""
-        fast = tuple(known for known in self.best.fit.names if known == QUANTISATION.name)
-        form = (name, *self.best.form)
-        fit = fit_names(self.moments, (*fast, WHITE.name, *form))
-        return Choice((ModelFit(form, fit, self.best.cost),), self.moments)
+        fast = tuple(known for known in self.best.names if known == QUANTISATION.name)
+        fit = fit_names(self.moments, (*fast, WHITE.name, name, *self.best.form))
+        return Choice((replace(fit, cost=self.best.cost),), self.moments)
 
-    def close(self, name: str) -> ModelFit | None:
+    def close(self, name: str) -> MomentFit | None:
         """Return the best form with a process among those that explain the curve nearly as well, or None."""
         near = [fit for fit in self.fits if name in fit.form and fit.cost - self.best.cost <= MAX_COST_EXCESS + PRICE_OF_TIME]
         return near[0] if near else None
@@ -100,7 +87,7 @@ def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
     """Fit every form, with quantisation where the curve shows it; `excess`: factor on all covariances of an unexplained curve."""
     fits = _all_forms(moments, (), excess)
     wider = fit_form(moments, fits[0].form, (QUANTISATION.name,))
-    if score_at_zero(moments, wider.fit) < QUANTISATION_P_VALUE:
+    if score_at_zero(moments, wider) < QUANTISATION_P_VALUE:
         fits = _all_forms(moments, (QUANTISATION.name,), excess)
     return Choice(fits, moments)
 
@@ -111,12 +98,12 @@ def _all_forms(moments, fast, excess):
     return tuple(sorted(fits, key=lambda found: found.cost))
 
 
-def fit_form(moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), *, excess: float = 1.0) -> ModelFit:
+def fit_form(moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), *, excess: float = 1.0) -> MomentFit:
     """Fit white noise, `fast` processes and the slow ones of a form; squares are divided by `excess`."""
     names = (*fast, WHITE.name, *form)
     fit = fit_names(moments, names)
     fit = _likeliest(moments, fit) if GAUSS_MARKOV in form else fit
-    return ModelFit(tuple(form), fit, log_cost(moments, fit, excess) + PRICE * len(names) + PRICE_OF_TIME * (GAUSS_MARKOV in form))
+    return replace(fit, cost=log_cost(moments, fit, excess) + PRICE * len(names) + PRICE_OF_TIME * (GAUSS_MARKOV in form))
 
 
 def _likeliest(moments, fit):
@@ -230,7 +217,7 @@ def identify_axis(moments: Moments) -> AxisNoise:
     moments = replace(moments, scatter=scatter_of(moments))
     choice = choose_form(moments, excess)
     best, rivals = choice.best, choice.rivals
-    fast = tuple(name for name in (QUANTISATION.name,) if name in best.fit.names)
+    fast = tuple(name for name in (QUANTISATION.name,) if name in best.names)
     terms: dict[str, Term] = {}
     for name in (*fast, WHITE.name, *best.form):
         terms |= _figures(choice, name, excess)
@@ -241,8 +228,8 @@ def identify_axis(moments: Moments) -> AxisNoise:
         for name in set(other.form) - set(best.form) - set(alternatives):
             alternatives |= _figures(choice, name, excess)
     return AxisNoise(_doubted(terms, best, rivals), best.form, tuple(rival.form for rival in rivals), alternatives,
-                     float(moments.scales.tau[moments.used][0]), excess, _hump(moments, best.fit) if excess > 1 else None, moments.scatter,
-                     best.fit)
+                     float(moments.scales.tau[moments.used][0]), excess, _hump(moments, best) if excess > 1 else None, moments.scatter,
+                     best)
 
 
 def scatter_of(moments: Moments) -> float:

@@ -32,7 +32,7 @@ class ModelChanges:
 
     added: tuple[str, ...] = ()
     """Added to the model because the data support them."""
-    unstable: tuple[str, ...] = ()
+    denied: tuple[str, ...] = ()
     """Not added because the estimates of parts of the recording differ; the standard deviations allow for them."""
     implausible: dict[str, float] = field(default_factory=dict)
     """
@@ -48,9 +48,7 @@ class ModelChanges:
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""
-        changes = (('added', list(self.added)), ('denied', list(self.unstable)), ('implausible', self.implausible),
-                   ('lacking', list(self.lacking)), ('unexplained', self.unexplained), ('stamp_jitter', self.stamp_jitter))
-        return {name: value for name, value in changes if value}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items() if value}
 
 
 @dataclass(frozen=True, eq=False)

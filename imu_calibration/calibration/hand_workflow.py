@@ -143,11 +143,6 @@ class HandResult(CalibrationResult):
 
     observations: ClassVar[str] = 'poses'
 
-    @property
-    def singular_values(self) -> np.ndarray:
-        """Empty: the directions of the poses are estimated too."""
-        return np.zeros(0)
-
     def window_errors(self) -> WindowErrors:
         """Return the errors of the poses, after: held out; relative to gravity along its estimated direction, and to zero rate."""
         hand, poses = self.hand, self.hand.poses

@@ -101,7 +101,7 @@ def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
         return {}
     proof = {}
     for sensor in SENSORS:
-        was, now = (min((_errors(dealt, model, sensor, each, regimes) for each in candidates), key=_total)
+        was, now = (min((_errors(dealt, model, sensor, each, regimes) for each in candidates), key=lambda errors: errors.squares.sum())
                     for dealt, candidates in (before, after))
         entry = _entry(was.squares.sum(axis=1), now.squares.sum(axis=1), counts.sum(axis=1))
         moving = {str(name): _entry(was.squares[:, k], now.squares[:, k], counts[:, k]) for k, name in enumerate(regimes)
@@ -145,10 +145,6 @@ def with_reference(model: SensorModel, values: np.ndarray, reference: np.ndarray
         if _of_reference(effect):
             values[model.slices[effect.key]] = reference[model.slices[effect.key]]
     return values
-
-
-def _total(errors):
-    return errors.squares.sum()
 
 
 def _of_reference(effect: Effect) -> bool:

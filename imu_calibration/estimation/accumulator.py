@@ -211,8 +211,8 @@ def _joined(first, second):
 def _without_within(window):
     if not window.pieces and all(len(s.within) == 0 and s.slow is None for s in window.sensors.values()):
         return window
-    sensors = {name: SensorStatistics(s.mean, s.within[:0].copy(), s.noise_variance, s.inflation) for name, s in window.sensors.items()}
-    return WindowStatistics(window.kind, window.time, window.duration, window.count, sensors, window.session, window.encoder_step)
+    sensors = {name: replace(s, within=s.within[:0].copy(), slow=None, slow_rows=0) for name, s in window.sensors.items()}
+    return replace(window, sensors=sensors, pieces={})
 
 
 def selected_columns(wide: SensorModel, narrow: SensorModel) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ import numpy as np
 from imu_calibration.calibration.coverage import Coverage, arrows_of, cells_of, group_states, label_of, seen_of, table_coverage
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.calibration.hand_workflow import HandResult
-from imu_calibration.calibration.pose_scan import EMPTY_SCAN, hand_coverage
+from imu_calibration.calibration.live_poses import EMPTY_SCAN, hand_coverage
 from imu_calibration.calibration.result import CalibrationResult, exit_code
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import InputError

@@ -215,7 +215,7 @@ def test_a_vibration_is_named_with_its_frequency_and_widens_the_intervals():
 def test_quantisation_is_taken_in_where_it_shows_only():
     with_steps = choose_form(moments_of({'white_noise': 1.0, 'quantisation': 0.1}, 1200.0, 6))
     without = choose_form(moments_of({'white_noise': 1.0}, 1200.0, 6))
-    assert 'quantisation' in with_steps.best.fit.names and 'quantisation' not in without.best.fit.names
+    assert 'quantisation' in with_steps.best.names and 'quantisation' not in without.best.names
 
 
 @pytest.mark.parametrize('seed', [1, 2, 3])
@@ -239,7 +239,7 @@ def test_a_correlation_time_that_fits_itself_gives_way_to_a_likelier_one():
     rng = np.random.default_rng((20261203, 10800, 3, 1, 4))
     truth = draw_truth('tactical', 'gyroscope', FORMS[rng.integers(len(FORMS))], rng)
     moments = moments_from(truth.draw(1_080_000, 0.01, rng), 0.01)
-    first, taken = fit_names(moments, ('white_noise', 'gauss_markov')), fit_form(moments, ('gauss_markov',)).fit
+    first, taken = fit_names(moments, ('white_noise', 'gauss_markov')), fit_form(moments, ('gauss_markov',))
     assert log_cost(moments, taken) < log_cost(moments, first) - 20 and first.processes[-1].time > 10 * truth.figures[TIME_KEY]
     assert taken.processes[-1].time == pytest.approx(truth.figures[TIME_KEY], rel=0.3)
     assert np.sqrt(taken.coefficients[-1]) == pytest.approx(truth.figures['gauss_markov'], rel=0.3)
@@ -290,11 +290,12 @@ def test_a_fit_without_variance_costs_infinitely_and_is_never_preferred():
     """Steps as large as the noise left a form without any coefficient: its cost was NaN, and no form remained (IndexError)."""
     moments = moments_of({'white_noise': 1.0}, 400.0)
     form = fit_form(moments, ())
-    empty = replace(form, fit=replace(form.fit, coefficients=np.zeros(1)), cost=log_cost(moments, replace(form.fit, coefficients=np.zeros(1))))
+    empty = replace(form, coefficients=np.zeros(1))
+    empty = replace(empty, cost=log_cost(moments, empty))
     assert empty.cost == np.inf and np.isfinite(form.cost)
     fits, weights = Choice((empty,), moments).having('white_noise')
     assert len(fits) == 1 and weights == [1.0]
-    assert Choice((form, empty), moments).having('white_noise')[0] == [form.fit]
+    assert Choice((form, empty), moments).having('white_noise')[0] == [form]
 
 
 def test_white_noise_that_is_not_seen_is_held_with_its_bound():

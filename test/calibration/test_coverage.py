@@ -9,8 +9,7 @@ import pytest
 from imu_calibration.calibration.advice import WEIGHTS, HandStep, _rollout, direction_words, foretold, shortest_turn
 from imu_calibration.calibration.coverage import DIRECTIONS, MIN_CELL_WORTH, Coverage, Step, label_of, table_coverage
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
-from imu_calibration.calibration.live_poses import LiveByHand
-from imu_calibration.calibration.pose_scan import EMPTY_SCAN, hand_coverage, knowledge_of
+from imu_calibration.calibration.live_poses import EMPTY_SCAN, LiveByHand, hand_coverage, knowledge_of
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.estimation.observability import MOTIONS, motions_about

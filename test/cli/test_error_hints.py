@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.pose_scan import PoseScan, hand_status
+from imu_calibration.calibration.live_poses import PoseScan, hand_status
 from imu_calibration.cli.main import main
 from imu_calibration.cli.parser import VERBS, make_parser
 from imu_calibration.core.errors import ERROR_KEYS, InputError, with_hint

@@ -12,8 +12,7 @@ from test_by_hand import GRAVITY, load, simulate
 from imu_calibration.calibration.advice import missing_motion
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
-from imu_calibration.calibration.live_poses import LiveByHand
-from imu_calibration.calibration.pose_scan import FACE_DIRECTIONS, unseen
+from imu_calibration.calibration.live_poses import FACE_DIRECTIONS, LiveByHand, unseen
 from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.references.options import CalibrationOptions

@@ -327,7 +327,7 @@ def merge(parts: Iterable[SessionData]) -> SessionData:
         ends = np.cumsum([len(window.time) for window in windows])
         total.kept, total.poses = windows[:int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))], total.poses + part.poses
         total.spreads = sorted(total.spreads + part.spreads, key=lambda spread: -spread.n_samples)[:MOST_ASKED]
-        total.counts = {key: _added(total.counts.get(key, 0), part.counts.get(key, 0)) for key in {**total.counts, **part.counts}}
+        total.counts = {key: total.counts.get(key, 0) + part.counts.get(key, 0) for key in {**total.counts, **part.counts}}
         total.largest_rate = max(total.largest_rate, part.largest_rate)
         total.largest_force = max(total.largest_force, part.largest_force)
         total.frame_id = total.frame_id or part.frame_id
@@ -338,10 +338,6 @@ def merge(parts: Iterable[SessionData]) -> SessionData:
             total.first_stamp_ns = part.first_stamp_ns if total.first_stamp_ns is None else total.first_stamp_ns
             total.last_stamp_ns = (total.last_stamp_ns or total.first_stamp_ns) + part.last_stamp_ns - part.first_stamp_ns
     return total
-
-
-def _added(a, b):
-    return a + b if isinstance(a, (int, float)) and isinstance(b, (int, float)) else a or b
 
 
 def naming(names: Sequence[str], session: int) -> Callable:
