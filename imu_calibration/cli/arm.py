@@ -9,10 +9,9 @@ EXAMPLES = ('session --imu-topic /imu_a/data_raw --imu-topic /imu_b/data_raw',
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common = parser.common.add_argument
     parser.add_argument('bag', metavar='BAG', help=BAG)
-    common('--imu-topic', metavar='TOPIC', action='append', required=True, help='give it twice: first A, then B')
-    common('--frame-id', metavar='FRAME', action='append', default=[], help='frame_id of A, then of B; for a topic with several')
+    parser.common('--imu-topic', metavar='TOPIC', action='append', required=True, help='give it twice: first A, then B')
+    parser.common('--frame-id', metavar='FRAME', action='append', default=[], help='frame_id of A, then of B; for a topic with several')
 
 
 def run(options: Options) -> VerbResult:

@@ -7,12 +7,11 @@ EXAMPLES = ('session --table table.yaml --output result', 'by_hand_session --gra
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common, expert = parser.common.add_argument, parser.expert.add_argument
     parser.add_argument('bags', nargs='+', metavar='BAG', help=BAG)
-    common('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
-    expert('--earlier', metavar='FILE', help='earlier calibration.yaml to compare (table only)')
-    common('--no-report', action='store_true', help='write calibration.yaml only')
-    expert('--jobs', type=int, help='recordings read at a time, default one per core')
+    parser.common('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
+    parser.expert('--earlier', metavar='FILE', help='earlier calibration.yaml to compare (table only)')
+    parser.common('--no-report', action='store_true', help='write calibration.yaml only')
+    parser.expert('--jobs', type=int, help='recordings read at a time, default one per core')
     parser.add_session()
 
 

@@ -8,9 +8,8 @@ EXAMPLES = ('later_session --calibration result/calibration.yaml --table table.y
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common = parser.common.add_argument
     parser.add_argument('bag', metavar='BAG', help=f'a recording of the calibrated IMU: {BAG}')
-    common('--calibration', metavar='FILE', required=True, help='calibration.yaml')
+    parser.common('--calibration', metavar='FILE', required=True, help='calibration.yaml')
     parser.add_recording('without it: by hand')
 
 

@@ -8,20 +8,19 @@ EXAMPLES = ('drive --calibration result/calibration.yaml --output drive_correcte
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common, expert = parser.common.add_argument, parser.expert.add_argument
     parser.add_argument('bag', metavar='BAG', help=BAG)
-    common('--calibration', metavar='FILE', required=True, help='calibration.yaml')
-    common('--output', metavar='BAG2', required=True, help='rosbag2 folder to make')
-    common('--corrected-topic', metavar='TOPIC', default='/imu/data_corrected', help='default /imu/data_corrected')
-    common('--target-frame', metavar='FRAME', default='',
-           help='move the corrected readings to another frame of the same rigid body')
-    expert('--target-xyz', metavar='M', nargs=3, type=float, default=(0.0, 0.0, 0.0),
-           help='place of the sensor in the target frame, m')
-    expert('--target-rpy', metavar='RAD', nargs=3, type=float, default=(0.0, 0.0, 0.0),
-           help='roll, pitch, yaw of the sensor in the target frame, rad')
-    common('--anyway', action='store_true', help='also correct a sensor with the decision harms')
-    expert('--noise', metavar='FILE', help='noise.yaml of this IMU, for the covariances where the messages bring none')
-    expert('--correct-stamps', action='store_true', help="move the stamps back by the calibration's time_offset")
+    parser.common('--calibration', metavar='FILE', required=True, help='calibration.yaml')
+    parser.common('--output', metavar='BAG2', required=True, help='rosbag2 folder to make')
+    parser.common('--corrected-topic', metavar='TOPIC', default='/imu/data_corrected', help='default /imu/data_corrected')
+    parser.common('--target-frame', metavar='FRAME', default='',
+                  help='move the corrected readings to another frame of the same rigid body')
+    parser.expert('--target-xyz', metavar='M', nargs=3, type=float, default=(0.0, 0.0, 0.0),
+                  help='place of the sensor in the target frame, m')
+    parser.expert('--target-rpy', metavar='RAD', nargs=3, type=float, default=(0.0, 0.0, 0.0),
+                  help='roll, pitch, yaw of the sensor in the target frame, rad')
+    parser.common('--anyway', action='store_true', help='also correct a sensor with the decision harms')
+    parser.expert('--noise', metavar='FILE', help='noise.yaml of this IMU, for the covariances where the messages bring none')
+    parser.expert('--correct-stamps', action='store_true', help="move the stamps back by the calibration's time_offset")
     parser.add_topics(joints=False)
 
 

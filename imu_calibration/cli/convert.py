@@ -10,13 +10,12 @@ EXAMPLES = ('log.csv --output session', 'log.csv --columns time=t:ms force=ax,ay
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common, expert = parser.common.add_argument, parser.expert.add_argument
     parser.add_argument('log', metavar='FILE', help='text with a header and columns separated by comma, semicolon, tab or spaces')
-    common('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
-    common('--columns', metavar='QUANTITY=NAMES:UNIT', nargs='+', default=[],
-           help='replaces the guess: time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s temperature=NAME:C joint.JOINT=NAME:deg; a name may be a '
-           'column number, a leading minus reverses the sign; units: s ms us ns, m/s^2 g mg, rad/s deg/s mdeg/s, rad deg')
-    expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
+    parser.common('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
+    parser.common('--columns', metavar='QUANTITY=NAMES:UNIT', nargs='+', default=[],
+                  help='replaces the guess: time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s temperature=NAME:C joint.JOINT=NAME:deg; a name may '
+                  'be a column number, a leading minus reverses the sign; units: s ms us ns, m/s^2 g mg, rad/s deg/s mdeg/s, rad deg')
+    parser.expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
 
 
 def run(options: Options) -> VerbResult:

@@ -7,10 +7,9 @@ EXAMPLES = ('session --table table.yaml --output finding', 'by_hand_session --ou
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common = parser.common.add_argument
     parser.add_argument('bag', metavar='BAG', help=BAG)
-    common('--output', metavar='DIR', required=True, help='folder for diagnosis.json, calibration.yaml and report.html')
-    common('--mcap', metavar='FILE', help='also write measured and simulated signals and the residuals as MCAP for Foxglove')
+    parser.common('--output', metavar='DIR', required=True, help='folder for diagnosis.json, calibration.yaml and report.html')
+    parser.common('--mcap', metavar='FILE', help='also write measured and simulated signals and the residuals as MCAP for Foxglove')
     parser.add_session(searched=False)
 
 

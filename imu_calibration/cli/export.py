@@ -8,15 +8,14 @@ EXAMPLES = ('--list', 'result/calibration.yaml --to kalibr --noise noise/noise.y
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common, expert = parser.common.add_argument, parser.expert.add_argument
     parser.add_argument('document', metavar='CALIBRATION', nargs='?', help='calibration.yaml')
-    common('--to', metavar='NAME', help='name of the program, listed by --list')
-    common('--list', action='store_true', help='list the programs and the parameters that each accepts')
-    common('--noise', metavar='FILE', help='noise.yaml of the verb noise')
-    expert('--rate', metavar='HZ', type=float, help='rate at which the program gets the readings; default that of noise.yaml')
-    common('--output', metavar='FILE', help='the file to write')
-    expert('--bag', metavar='BAG', help='recording on which the loss is measured; default: a standard motion')
-    expert('--anyway', action='store_true', help='also write a sensor with the decision harms; without it nominal values')
+    parser.common('--to', metavar='NAME', help='name of the program, listed by --list')
+    parser.common('--list', action='store_true', help='list the programs and the parameters that each accepts')
+    parser.common('--noise', metavar='FILE', help='noise.yaml of the verb noise')
+    parser.expert('--rate', metavar='HZ', type=float, help='rate at which the program gets the readings; default that of noise.yaml')
+    parser.common('--output', metavar='FILE', help='the file to write')
+    parser.expert('--bag', metavar='BAG', help='recording on which the loss is measured; default: a standard motion')
+    parser.expert('--anyway', action='store_true', help='also write a sensor with the decision harms; without it nominal values')
     parser.add_recording('motion of --bag; without it: from its readings')
 
 

@@ -7,13 +7,12 @@ EXAMPLES = ('units --table table.yaml --output fleet', 'units --table table.yaml
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common = parser.common.add_argument
     parser.add_argument('folder', metavar='FOLDER', help='folder that holds one bag, or one sub-folder with bags, per unit')
-    common('--output', metavar='DIR', required=True,
-           help='folder for one result per unit, summary.csv, units.csv and summary.html')
-    common('--jobs', type=int, help='units calibrated side by side, default one per processor')
-    common('--scheduler', metavar='ADDRESS', help='address of a dask scheduler (needs the extra dask)')
-    common('--no-report', action='store_true', help='no report.html per unit')
+    parser.common('--output', metavar='DIR', required=True,
+                  help='folder for one result per unit, summary.csv, units.csv and summary.html')
+    parser.common('--jobs', type=int, help='units calibrated side by side, default one per processor')
+    parser.common('--scheduler', metavar='ADDRESS', help='address of a dask scheduler (needs the extra dask)')
+    parser.common('--no-report', action='store_true', help='no report.html per unit')
     parser.add_recording('a table or robot is required, the same for all units')
     parser.add_model()
 

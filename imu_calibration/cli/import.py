@@ -7,11 +7,10 @@ EXAMPLES = ('imu.yaml --from kalibr --output calibration.yaml', 'params.txt --fr
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common = parser.common.add_argument
     parser.add_argument('file', metavar='FILE', help='file of the other program')
-    common('--from', dest='source', metavar='NAME', required=True, help="the program, as 'export --list' shows it")
-    common('--output', metavar='FILE', required=True, help='calibration.yaml to write')
-    common('--frame-id', metavar='FRAME', default='', help='frame_id of the Imu messages, where it shall be checked')
+    parser.common('--from', dest='source', metavar='NAME', required=True, help="the program, as 'export --list' shows it")
+    parser.common('--output', metavar='FILE', required=True, help='calibration.yaml to write')
+    parser.common('--frame-id', metavar='FRAME', default='', help='frame_id of the Imu messages, where it shall be checked')
 
 
 def run(options: Options) -> VerbResult:

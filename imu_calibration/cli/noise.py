@@ -9,15 +9,14 @@ EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common, expert = parser.common.add_argument, parser.expert.add_argument
     parser.add_argument('bag', metavar='BAG', help='a recording that holds rest, an hour if possible; motion is found and left out')
-    common('--output', metavar='DIR', required=True, help='folder for noise.yaml and report.html')
-    common('--rate', metavar='HZ', type=float, action='append', default=[],
-           help='also print the discrete figures for this sampling rate; may be repeated')
-    expert('--horizon', metavar='S', type=float,
-           help='averaging time at which a random walk replaces other slow noise, default 100 s')
-    expert('--nominal', metavar='FILE', help='YAML with offsets and scales for recordings in volts or counts')
-    common('--no-report', action='store_true', help='write noise.yaml only')
+    parser.common('--output', metavar='DIR', required=True, help='folder for noise.yaml and report.html')
+    parser.common('--rate', metavar='HZ', type=float, action='append', default=[],
+                  help='also print the discrete figures for this sampling rate; may be repeated')
+    parser.expert('--horizon', metavar='S', type=float,
+                  help='averaging time at which a random walk replaces other slow noise, default 100 s')
+    parser.expert('--nominal', metavar='FILE', help='YAML with offsets and scales for recordings in volts or counts')
+    parser.common('--no-report', action='store_true', help='write noise.yaml only')
     parser.add_topics(joints=False)
 
 

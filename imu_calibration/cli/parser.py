@@ -56,13 +56,13 @@ BAG = 'rosbag2 folder, .db3, .mcap, ROS 1 .bag, text (.csv)'
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Refuses with one line and exit code 1; options are in the groups `common` and `expert`."""
+    """Refuses with one line and exit code 1; `common` and `expert` declare an option in one of the two groups."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **{'add_help': False, **options})
-        self.common = self.add_argument_group('common options')
-        self.expert = self.add_argument_group('expert options')
-        self.common.add_argument('-h', '--help', action='help', help='print this page')
+        self.common = self.add_argument_group('common options').add_argument
+        self.expert = self.add_argument_group('expert options').add_argument
+        self.common('-h', '--help', action='help', help='print this page')
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse; an unknown option is refused with the closest known one."""
@@ -80,22 +80,20 @@ class OneLineParser(argparse.ArgumentParser):
 
     def add_topics(self, *, joints: bool = True) -> None:
         """Add the options that choose topics."""
-        common, expert = self.common.add_argument, self.expert.add_argument
-        common('--imu-topic', metavar='TOPIC', help='default /imu/data_raw, else the only Imu topic')
-        expert('--frame-id', metavar='FRAME', help='frame_id of the Imu messages; for a topic with several')
+        self.common('--imu-topic', metavar='TOPIC', help='default /imu/data_raw, else the only Imu topic')
+        self.expert('--frame-id', metavar='FRAME', help='frame_id of the Imu messages; for a topic with several')
         if joints:
-            common('--joint-topic', metavar='TOPIC', help='default /joint_states, else the only JointState topic')
-        expert('--temperature-topic', metavar='TOPIC', help='default /imu/temperature, else the only one')
+            self.common('--joint-topic', metavar='TOPIC', help='default /joint_states, else the only JointState topic')
+        self.expert('--temperature-topic', metavar='TOPIC', help='default /imu/temperature, else the only one')
 
     def add_stand(self, without: str) -> None:
         """Add the options of the table or arm that moves the IMU; `without` describes the case without them."""
-        common, expert = self.common.add_argument, self.expert.add_argument
-        common('--table', metavar='TABLE', help=f'description of the table (YAML); {without}')
-        common('--urdf', metavar='FILE', help='robot description in place of a table; --table adds up, gravity, mount, limits')
-        common('--imu-link', metavar='LINK',
-               help='link with the IMU, default its frame_id; without --urdf: of /robot_description in the bag')
-        expert('--allow-xacro', action='store_true', help='expand a .xacro file; it is a program: only from authors you trust')
-        expert('--up', type=float, nargs=3, metavar=('X', 'Y', 'Z'), help='up in the root frame; default TABLE, /tf_static or z')
+        self.common('--table', metavar='TABLE', help=f'description of the table (YAML); {without}')
+        self.common('--urdf', metavar='FILE', help='robot description in place of a table; --table adds up, gravity, mount, limits')
+        self.common('--imu-link', metavar='LINK',
+                    help='link with the IMU, default its frame_id; without --urdf: of /robot_description in the bag')
+        self.expert('--allow-xacro', action='store_true', help='expand a .xacro file; it is a program: only from authors you trust')
+        self.expert('--up', type=float, nargs=3, metavar=('X', 'Y', 'Z'), help='up in the root frame; default TABLE, /tf_static or z')
 
     def add_recording(self, without: str) -> None:
         """Add the options of the table or arm and of the topics of a recording; `without` as for `add_stand`."""
@@ -104,35 +102,33 @@ class OneLineParser(argparse.ArgumentParser):
 
     def add_session(self, *, searched: bool = True) -> None:
         """Add the options of a calibration: local gravity, recording, labels of the result, and model (`add_model`)."""
-        common = self.common.add_argument
-        common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
-        common('--latitude', metavar='DEG', type=float, help='gravity from the latitude (WGS 84)')
-        common('--height', metavar='M', type=float, help='and height above the ellipsoid, default 0 m')
+        self.common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
+        self.common('--latitude', metavar='DEG', type=float, help='gravity from the latitude (WGS 84)')
+        self.common('--height', metavar='M', type=float, help='and height above the ellipsoid, default 0 m')
         self.add_recording('without it: by hand, gravity is the reference')
-        common('--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml')
-        common('--operator', metavar='TEXT', help='name of the operator, likewise')
-        common('--force', action='store_true', help='overwrite the result of another verb or other inputs')
+        self.common('--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml')
+        self.common('--operator', metavar='TEXT', help='name of the operator, likewise')
+        self.common('--force', action='store_true', help='overwrite the result of another verb or other inputs')
         self.add_model(searched=searched)
 
     def add_model(self, *, searched: bool = True) -> None:
         """Add the options that choose the parameters to estimate; `searched`: and the option that omits the search for effects."""
-        expert = self.expert.add_argument
-        expert('--accelerometer-model', metavar='MODEL',
-               help='effects joined by +; default bias+matrix, and accel_size_effect if observable')
-        expert('--gyroscope-model', metavar='MODEL', help='likewise; default bias+matrix')
-        expert('--reference-model', metavar='MODEL', help="effects of table and clock, or 'none'; default table_tilt")
+        self.expert('--accelerometer-model', metavar='MODEL',
+                    help='effects joined by +; default bias+matrix, and accel_size_effect if observable')
+        self.expert('--gyroscope-model', metavar='MODEL', help='likewise; default bias+matrix')
+        self.expert('--reference-model', metavar='MODEL', help="effects of table and clock, or 'none'; default table_tilt")
         self.add_effects(self.expert)
-        expert('--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect')
-        expert('--nominal', metavar='FILE', help='offsets and scales of recordings in volts or counts')
-        expert('--noise', metavar='FILE', help='noise.yaml of this IMU: model of its biases (table only)')
-        expert('--setting', metavar='NAME=VALUE', action='append', default=[],
-               help='of the window detection; an unknown name lists all')
+        self.expert('--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect')
+        self.expert('--nominal', metavar='FILE', help='offsets and scales of recordings in volts or counts')
+        self.expert('--noise', metavar='FILE', help='noise.yaml of this IMU: model of its biases (table only)')
+        self.expert('--setting', metavar='NAME=VALUE', action='append', default=[],
+                    help='of the window detection; an unknown name lists all')
         if searched:
-            expert('--model-as-asked', action='store_true', help='add no effect to the requested model')
+            self.expert('--model-as-asked', action='store_true', help='add no effect to the requested model')
 
-    def add_effects(self, group: argparse._ArgumentGroup) -> None:
-        """Add the option of effects in addition to the catalogue."""
-        group.add_argument('--effects', dest='catalogue', metavar='FILE', help='YAML or calibration.yaml with additional effects')
+    def add_effects(self, add: Callable[..., Any]) -> None:
+        """Add the option of effects in addition to the catalogue, by `common` or `expert`."""
+        add('--effects', dest='catalogue', metavar='FILE', help='YAML or calibration.yaml with additional effects')
 
 
 class Options(argparse.Namespace):
@@ -202,9 +198,9 @@ def add_verbs(parser: argparse.ArgumentParser, verb: str | None = None, *, requi
             continue
         module = import_module(f'imu_calibration.cli.{name}')
         module.add_arguments(added)
-        added.common.add_argument('--json', action='store_true', help='print the result as one JSON document')
-        added.common.add_argument('--quiet', action='store_true', help='print errors and warnings only')
-        added.common.add_argument('--verbose', action='store_true', help='print each phase with its time on standard error')
+        added.common('--json', action='store_true', help='print the result as one JSON document')
+        added.common('--quiet', action='store_true', help='print errors and warnings only')
+        added.common('--verbose', action='store_true', help='print each phase with its time on standard error')
         added.set_defaults(run=module.run, verb_options=sorted(added._option_string_actions))
         words = [action for action in added._actions if action.required]
         added.usage = ' '.join(['%(prog)s', *map(_usage, words), '[options]'])

@@ -11,28 +11,28 @@ EXAMPLES = ('--effect gyro_g_sensitivity --grade consumer --table table.yaml --o
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common, expert = parser.common.add_argument, parser.expert.add_argument
-    common('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
-    common('--calibration', metavar='FILE', help='simulate with a fitted or extended model instead of a random IMU')
-    common('--replay', metavar='BAG', help='simulate the IMU of --calibration on the joints, stamps, temperature and noise of a recording')
-    common('--effect', metavar='NAME', action='append', default=[], help='add an effect of the catalogue; may be repeated')
-    expert('--size', type=float, default=0.3,
-           help='size of added effects as a share of the largest plausible one, default 0.3')
+    parser.common('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
+    parser.common('--calibration', metavar='FILE', help='simulate with a fitted or extended model instead of a random IMU')
+    parser.common('--replay', metavar='BAG',
+                  help='simulate the IMU of --calibration on the joints, stamps, temperature and noise of a recording')
+    parser.common('--effect', metavar='NAME', action='append', default=[], help='add an effect of the catalogue; may be repeated')
+    parser.expert('--size', type=float, default=0.3,
+                  help='size of added effects as a share of the largest plausible one, default 0.3')
     parser.add_effects(parser.expert)
-    common('--profile', metavar='NAME', default='calibration', help='motion, default calibration; an unknown name lists all')
-    common('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
-    common('--seed', type=int, default=0, help='seed of noise and motion, default 0')
-    expert('--imu-seed', metavar='SEED', type=int, help='seed of the IMU itself, default the same: two sessions of one IMU share it')
-    common('--duration', type=float, help='wanted length, s')
-    expert('--imu-rate', metavar='HZ', type=float, default=100.0, help='Hz, default 100')
-    expert('--joint-rate', metavar='HZ', type=float, default=100.0, help='Hz, default 100')
-    expert('--encoder-resolution-deg', metavar='DEG', type=float, default=0.0, help='step of the joint positions, deg, default none')
-    expert('--stamp-jitter-us', metavar='US', type=float, default=0.0,
-           help='standard deviation of the IMU stamps, microseconds, default none')
-    expert('--temperature', action='store_true', help='publish a temperature that warms up from 25 C')
+    parser.common('--profile', metavar='NAME', default='calibration', help='motion, default calibration; an unknown name lists all')
+    parser.common('--grade', choices=sorted(GRADES), default='industrial', help='grade of the IMU, default industrial')
+    parser.common('--seed', type=int, default=0, help='seed of noise and motion, default 0')
+    parser.expert('--imu-seed', metavar='SEED', type=int, help='seed of the IMU itself, default the same: two sessions of one IMU share it')
+    parser.common('--duration', type=float, help='wanted length, s')
+    parser.expert('--imu-rate', metavar='HZ', type=float, default=100.0, help='Hz, default 100')
+    parser.expert('--joint-rate', metavar='HZ', type=float, default=100.0, help='Hz, default 100')
+    parser.expert('--encoder-resolution-deg', metavar='DEG', type=float, default=0.0, help='step of the joint positions, deg, default none')
+    parser.expert('--stamp-jitter-us', metavar='US', type=float, default=0.0,
+                  help='standard deviation of the IMU stamps, microseconds, default none')
+    parser.expert('--temperature', action='store_true', help='publish a temperature that warms up from 25 C')
     parser.add_recording('default a three-axis table')
-    expert('--storage', choices=identifiers(), default='sqlite3', help='default sqlite3')
-    expert('--compression', choices=('none', 'zstd', 'lz4'), default='none', help='of the chunks of an mcap, default none')
+    parser.expert('--storage', choices=identifiers(), default='sqlite3', help='default sqlite3')
+    parser.expert('--compression', choices=('none', 'zstd', 'lz4'), default='none', help='of the chunks of an mcap, default none')
 
 
 def run(options: Options) -> VerbResult:

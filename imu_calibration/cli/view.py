@@ -7,11 +7,10 @@ EXAMPLES = ('session --table table.yaml --output session.mcap', 'result --output
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common = parser.common.add_argument
     parser.add_argument('source', metavar='BAG|RESULT', help='a recording, which is calibrated, or calibration.yaml (its folder), of which '
                         'the parameters are shown')
-    common('--output', metavar='FILE', required=True, help='the MCAP to write')
-    common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
+    parser.common('--output', metavar='FILE', required=True, help='the MCAP to write')
+    parser.common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
     parser.add_recording('without it: by hand, gravity is the reference')
     parser.add_model()
 

@@ -17,10 +17,9 @@ WATCH_PERIOD_SECONDS = 0.25
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    common = parser.common.add_argument
-    common('--node', metavar='NAME', default='calibration_node', help='full name of the node, default calibration_node')
-    common('--patience', metavar='SECONDS', type=float, default=10.0, help='how long to wait for it, default 10')
-    common('--once', action='store_true', help='show the present status and end')
+    parser.common('--node', metavar='NAME', default='calibration_node', help='full name of the node, default calibration_node')
+    parser.common('--patience', metavar='SECONDS', type=float, default=10.0, help='how long to wait for it, default 10')
+    parser.common('--once', action='store_true', help='show the present status and end')
 
 
 def run(options: Options) -> VerbResult:

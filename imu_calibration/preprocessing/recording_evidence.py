@@ -9,18 +9,8 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.samples import smallest_step
+from imu_calibration.preprocessing import scan
 from imu_calibration.preprocessing.full_scale import Extremes, Turning, factor_between_rests, relate_turns
-from imu_calibration.preprocessing.scan import (
-    Chunks,
-    ChunkSeries,
-    FrozenPart,
-    Rest,
-    StandingJoints,
-    find_rest,
-    frozen_chunks,
-    frozen_joints,
-    frozen_parts,
-)
 from imu_calibration.preprocessing.stream_cleaning import CleanedBlock, StreamStatistics
 
 RESOLUTION_SAMPLES = 20_000
@@ -33,7 +23,7 @@ class RecordingEvidence:
 
     streams: dict[str, StreamStatistics]
     """'imu', 'joints', 'temperature' -> rates, gaps, drops; only streams with accepted samples."""
-    chunks: Chunks
+    chunks: scan.Chunks
     """Readings of the IMU in short chunks."""
     n_samples: int
     """IMU samples that were checked."""
@@ -55,23 +45,23 @@ class RecordingEvidence:
     @cached_property
     def frozen(self) -> dict[str, np.ndarray]:
         """Sensor -> in which chunks it gives one reading again and again, bool, shape (n,)."""
-        return frozen_chunks(self.chunks, self.resolution)
+        return scan.frozen_chunks(self.chunks, self.resolution)
 
     @cached_property
-    def awake(self) -> Chunks:
+    def awake(self) -> scan.Chunks:
         """The chunks in which no sensor is frozen."""
         return self.chunks.select(~np.logical_or(*self.frozen.values()))
 
     @cached_property
-    def frozen_parts(self) -> list[FrozenPart]:
+    def frozen_parts(self) -> list[scan.FrozenPart]:
         """Where a sensor is frozen, or the joints are while the IMU turns."""
         rate = np.zeros(3) if self.rest is None else self.rest.rate
-        return frozen_parts(self.chunks, self.frozen) + frozen_joints(self.awake, self.still_joints_ns, rate)
+        return scan.frozen_parts(self.chunks, self.frozen) + scan.frozen_joints(self.awake, self.still_joints_ns, rate)
 
     @cached_property
-    def rest(self) -> Rest | None:
+    def rest(self) -> scan.Rest | None:
         """Readings while steady, or None."""
-        return find_rest(self.awake)
+        return scan.find_rest(self.awake)
 
     @cached_property
     def turning(self) -> Turning | None:
@@ -103,8 +93,8 @@ class EvidenceGatherer:
 
     def __init__(self, gravity: float):
         self.gravity = gravity
-        self._chunks, self._ends = ChunkSeries(), tuple((Extremes(), Extremes()) for _ in range(6))
-        self._resolution, self._joints = np.full(6, np.inf), StandingJoints()
+        self._chunks, self._ends = scan.ChunkSeries(), tuple((Extremes(), Extremes()) for _ in range(6))
+        self._resolution, self._joints = np.full(6, np.inf), scan.StandingJoints()
         self._temperature_c: tuple[float, float] | None = None
 
     def push(self, cleaned: CleanedBlock) -> None:

@@ -15,18 +15,7 @@ from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import UNKNOWN_SD, Calibration
 from imu_calibration.document.calibration_text import check_numbers, from_mapping
 from imu_calibration.document.decision import UNPROVEN
-from imu_calibration.document.exports.affine import (
-    MATRICES,
-    OFFSETS,
-    AffineImu,
-    Capability,
-    Placement,
-    capability_of,
-    find_pose,
-    held_values,
-    moved,
-    of,
-)
+from imu_calibration.document.exports import affine
 from imu_calibration.document.exports.target import Numbers, Read, Readings, Target
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import sensor_output
@@ -152,7 +141,7 @@ class Loss:
         return not self.effects and max(self.left.values()) < ROUNDING_LOSS
 
 
-def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, placement: Placement, motion: TrialMotion) -> Loss:
+def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, placement: affine.Placement, motion: TrialMotion) -> Loss:
     """
     Return the loss of a target on a motion.
 
@@ -174,7 +163,7 @@ def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, place
     ref, effects = motion.reference, {effect.key: effect for effect in model.effects}
     read = {sensor: sensor_output(model, sensor, values, ref=ref) for sensor in SENSORS}
     without = values.copy()
-    estimated = tuple(e for e in effects.values() if capability_of(e, target.estimates) and e.key in calibration.model.slices)
+    estimated = tuple(e for e in effects.values() if affine.capability_of(e, target.estimates) and e.key in calibration.model.slices)
     for effect in estimated:
         without[model.slices[effect.key]] = effect.prior_values()
     seen = {sensor: sensor_output(model, sensor, without, ref=ref) for sensor in SENSORS}
@@ -191,16 +180,16 @@ def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, place
                 {s: _rms(read[s] - t) for s, t in zip(SENSORS, (ref.force_s, ref.rate_s))}, motion.text)
 
 
-def _whole(calibration, effect, holds: tuple[Capability, ...]):
+def _whole(calibration, effect, holds: tuple[affine.Capability, ...]):
     values = calibration.values[calibration.model.slices[effect.key]]
-    return np.array_equal(held_values(calibration, effect, capability_of(effect, holds)), values)
+    return np.array_equal(affine.held_values(calibration, effect, affine.capability_of(effect, holds)), values)
 
 
 def _lost(calibration, effect, holds, motion):
     """Return the part of the readings due to the part of an effect that is not represented."""
     model, values = invertible_values(calibration)
-    capability, less = capability_of(effect, holds), values.copy()
-    less[model.slices[effect.key]] = held_values(calibration, effect, capability)
+    capability, less = affine.capability_of(effect, holds), values.copy()
+    less[model.slices[effect.key]] = affine.held_values(calibration, effect, capability)
     change = [sensor_output(model, effect.sensor, v, ref=motion.reference) for v in (values, less)]
     return LostEffect(effect, capability is not None, _rms(change[0] - change[1]))
 
@@ -239,23 +228,23 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
     if target.whole:
         return from_mapping(found.numbers)
     assert target.imu is not None
-    read, own = target.imu(found.numbers), find_pose(content)
+    read, own = target.imu(found.numbers), affine.find_pose(content)
     if own is None:
-        return _document(target, found, moved(read, target.back(read)), target.axes, path, frame_id)
+        return _document(target, found, affine.moved(read, target.back(read)), target.axes, path, frame_id)
     placement, parent = own
-    return _document(target, found, moved(read, placement.inverse()), 'mount', path, frame_id or parent)
+    return _document(target, found, affine.moved(read, placement.inverse()), 'mount', path, frame_id or parent)
 
 
-def _document(target: Target, found: Read, imu: AffineImu, axes: str, path: Any, frame_id: str) -> Calibration:
+def _document(target: Target, found: Read, imu: affine.AffineImu, axes: str, path: Any, frame_id: str) -> Calibration:
     holds = tuple(capability for capability in target.holds if capability not in found.lacks)
     # Bias and matrix always, further effects where the file gives them a value.
-    named = [*OFFSETS, *MATRICES, *(capability for capability in holds if np.any(imu.value(capability)))]
-    accelerometer, gyroscope = (tuple(dict.fromkeys(capability.effect.name for capability in of(sensor, named))) for sensor in SENSORS)
+    named = [*affine.OFFSETS, *affine.MATRICES, *(capability for capability in holds if np.any(imu.value(capability)))]
+    accelerometer, gyroscope = (tuple(dict.fromkeys(each.effect.name for each in affine.of(sensor, named))) for sensor in SENSORS)
     model = SensorModel(accelerometer, gyroscope, temperature_ref_c=imu.temperature_ref_c)
     values, sd = model.prior()
     status = np.full(len(values), HELD, dtype=object)
     for effect in model.effects:
-        capability, part = capability_of(effect, holds), model.slices[effect.key]
+        capability, part = affine.capability_of(effect, holds), model.slices[effect.key]
         if capability is not None:
             values[part] = imu.value(capability).ravel()
             known = np.eye(3).ravel() > 0 if capability.own_axis else np.full(effect.size, True)
