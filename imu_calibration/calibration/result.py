@@ -103,14 +103,14 @@ class CalibrationResult(ABC):
         """Return the standard deviation of each parameter by cause."""
 
 
-def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> tuple[str, list[str]]:
+def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> list[str]:
     """
-    Return (the more cautious decision, lines for the user: decisions, parameters, warnings, notes and next steps).
+    Return the lines for the user: decisions, parameters, warnings, notes and next steps.
 
     `hints` as for `errors.with_hint`.
     """
-    lines, hint = result.verdict.lines(hints), usage(result.calibration)
-    return str(result.verdict.word), [*lines, *[hint] * bool(hint)]
+    hint = usage(result.calibration)
+    return [*result.verdict.lines(hints), *[hint] * bool(hint)]
 
 
 def exit_code(calibration: Calibration) -> int:

@@ -49,7 +49,7 @@ def show_calibration(found: 'Calibrated', folder: Path, hints: dict[str, str], *
     """Print the parameters of a `Calibrated`, the decisions and where the files are."""
     out = Terminal.of()
     show_table(out, PARAMETER_HEADINGS, parameter_rows(found.calibration), numbers=NUMBER_COLUMNS)
-    for line in summary(found.result, hints)[1]:
+    for line in summary(found.result, hints):
         out.print(line)
     files = 'calibration.yaml' + (' and report.html' if report else '')
     out.print(f'written: {files} in {folder}')

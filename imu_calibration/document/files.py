@@ -195,8 +195,7 @@ def _hash_of_unchanged(files):
     digest = hashlib.sha256()
     for file, *_ in files:
         with open(file, 'rb') as stream:
-            while chunk := stream.read(1 << 20):
-                digest.update(chunk)
+            hashlib.file_digest(stream, lambda: digest)
     return digest.hexdigest()
 
 

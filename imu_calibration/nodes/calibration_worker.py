@@ -331,8 +331,7 @@ class CalibrationWorker(threading.Thread):
     def _solve(self) -> tuple[bool, str]:
         result, _ = self._publish_solution(pending=True)
         self._diagnosis.want()
-        _, lines = summary(result, self.hints)
-        return True, f'{result.verdict.text} ({self.live.n_windows} {self.gathered})' + ''.join(f'; {line}' for line in lines)
+        return True, '; '.join([f'{result.verdict.text} ({self.live.n_windows} {self.gathered})', *summary(result, self.hints)])
 
     def _diagnose(self) -> tuple[bool, str]:
         if not self._diagnosis_period:
@@ -382,8 +381,9 @@ class CalibrationWorker(threading.Thread):
         counts = self.live.counts
         self._watch.note_counts(counts, self._looked)
         result = self.live.result
-        verdict, lines = ('', []) if result is None else summary(result, self.hints)
-        judged, complete = ('', False) if result is None else (result.verdict.text, result.verdict.complete)
+        lines = [] if result is None else summary(result, self.hints)
+        verdict, judged, complete = ('', '', False) if result is None else (
+            str(result.verdict.word), result.verdict.text, result.verdict.complete)
         values = {self.gathered: self.live.n_windows, 'solutions': self._n_solutions, 'saves to': str(self.place.calibration),
                   f'{self.gathered} in no file yet': self.place.unsaved(self.live), 'process': os.getpid(), **counts}
         if self.live.needs_linearising:

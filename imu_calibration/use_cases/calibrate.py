@@ -68,11 +68,11 @@ class Calibrated:
         return repr(self.calibration)
 
     def __str__(self):
-        return '\n'.join([str(self.calibration), *(f'  {line}' for line in summary(self.result)[1])])
+        return '\n'.join([str(self.calibration), *(f'  {line}' for line in summary(self.result))])
 
     def _repr_html_(self):
         from markupsafe import escape
-        lines = ''.join(f'<li>{escape(line)}</li>' for line in summary(self.result)[1])
+        lines = ''.join(f'<li>{escape(line)}</li>' for line in summary(self.result))
         return f'<p><b>{self.verdict.text}</b></p><ul>{lines}</ul>{self.calibration._repr_html_()}'
 
 
