@@ -31,7 +31,7 @@ from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
-from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, Watcher
+from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.equations import TurnData
@@ -185,6 +185,8 @@ class HandRecording:
     """Temperature at the samples, degrees Celsius, shape (n,), when it was recorded."""
     counts: dict
     """Reason -> number of unusable samples."""
+    findings: tuple[CheckFinding, ...] = ()
+    """Findings of the checks of the recording."""
 
     @property
     def gathered(self) -> SessionData:
@@ -197,9 +199,9 @@ class HandRecording:
                         temperature_c=None if warm is None else (float(warm.min()), float(warm.max())))
 
 
-def read_by_hand(blocks: Iterable[SampleBlock], nominal: NominalScaling | None = None, watchers: Sequence[Watcher] = ()) -> HandRecording:
+def read_by_hand(blocks: Iterable[SampleBlock], nominal: NominalScaling | None = None, preflight: Preflight | None = None) -> HandRecording:
     """
-    Return the `HandRecording` of a complete stream of SampleBlock; `nominal` and `watchers` as for the `BlockCleaner`.
+    Return the `HandRecording` of a complete stream of SampleBlock, with the findings of `preflight`; `nominal` as for the `BlockCleaner`.
 
     Raises
     ------
@@ -207,7 +209,8 @@ def read_by_hand(blocks: Iterable[SampleBlock], nominal: NominalScaling | None =
         When no usable sample remains.
 
     """
-    cleaner, joined, temperatures = BlockCleaner(nominal=nominal, watchers=watchers), JoinedParts(), []
+    cleaner = BlockCleaner(nominal=nominal, watchers=[] if preflight is None else [preflight])
+    joined, temperatures = JoinedParts(), []
     for cleaned in cleaner.all_of(blocks):
         for _, imu in cleaned.imu:
             joined.add(imu)
@@ -220,7 +223,8 @@ def read_by_hand(blocks: Iterable[SampleBlock], nominal: NominalScaling | None =
         start = imu.stamp_ns[0]  # epochs in nanoseconds do not fit a float
         warm = np.interp((imu.stamp_ns - start).astype(float), (known.stamp_ns - start).astype(float), known.temperature_c)
     counts = cleaner.lost | {reason: count for reason, count in cleaner.counts.items() if reason.startswith('imu ')}
-    return HandRecording(imu, warm, {reason: count for reason, count in counts.items() if count})
+    return HandRecording(imu, warm, {reason: count for reason, count in counts.items() if count},
+                         () if preflight is None else tuple(preflight.findings))
 
 
 def calibrate_without_table(sources: Sequence[Callable], options: CalibrationOptions = CalibrationOptions(),
@@ -244,22 +248,20 @@ def calibrate_without_table(sources: Sequence[Callable], options: CalibrationOpt
     """
     if len(sources) != 1:
         raise InputError(f'calibration by hand needs one recording, got {len(sources)}; calibrate them separately and compare the results')
-    preflight = Preflight(options.gravity)
-    recording = read_by_hand(sources[0](), options.nominal, [preflight])
-    return evident_result(recording, options, provenance, findings=preflight.findings)[0]
+    return evident_result(read_by_hand(sources[0](), options.nominal, Preflight(options.gravity)), options, provenance)[0]
 
 
 def evident_result(recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None, *,
-                   stills: Sequence[slice] | None = None, findings: Sequence[CheckFinding] = ()) -> tuple[HandResult, EvidentHand]:
-    """Return (the HandResult, the search results); `stills` as in `calibrate_by_hand`, `findings` of a check."""
+                   stills: Sequence[slice] | None = None) -> tuple[HandResult, EvidentHand]:
+    """Return (the HandResult, the search results); `stills` as in `calibrate_by_hand`."""
     asked = hand_options(options)
     data = gather_by_hand(recording.imu, stills, temperature_c=recording.temperature_c)
     evident = solve_by_evidence(data, asked, as_asked=options.as_asked)
-    return hand_result(evident, recording, options, provenance=provenance, findings=findings, turns=data.turns), evident
+    return hand_result(evident, recording, options, provenance=provenance, turns=data.turns), evident
 
 
 def hand_result(evident: EvidentHand, recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), *,
-                provenance: dict | None = None, findings: Sequence[CheckFinding] = (), turns: Sequence[TurnData] = ()) -> HandResult:
+                provenance: dict | None = None, turns: Sequence[TurnData] = ()) -> HandResult:
     """
     Return an EvidentHand as a result for reports and documents, evaluated on its poses and `turns` if these are enough.
 
@@ -272,7 +274,7 @@ def hand_result(evident: EvidentHand, recording: HandRecording, options: Calibra
     hand = with_weak_replaced(evident.hand, evident.hand.tolerances)
     check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
     gathered = recording.gathered
-    gathered.findings = (*findings, *notes(hand.statistics['bias_moved'], gathered.duration))
+    gathered.findings = (*recording.findings, *notes(hand.statistics['bias_moved'], gathered.duration))
     advice = missing_motion(hand)
     calibration = document(hand, hand.tolerances, gathered, gravity=hand.gravity, gauge=dict(GAUGE), undetermined=advice,
                            statistics=_statistics(hand, gathered.counts, len(recording.imu)), provenance=provenance,
@@ -315,16 +317,15 @@ def check_by_hand(source: Callable, calibration: Calibration, options: Calibrati
         When the recording cannot be used.
 
     """
-    preflight = Preflight(options.gravity)
-    recording = read_by_hand(source(), options.nominal, [preflight])
+    recording = read_by_hand(source(), options.nominal, Preflight(options.gravity))
     try:
         data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
     except NotObservableError as error:
-        return CheckResult({}, preflight.findings, str(error))
+        return CheckResult({}, recording.findings, str(error))
     check_force(float(np.median(np.linalg.norm(data.poses.force, axis=1))))
     warm = None if recording.temperature_c is None else TemperatureSamples(recording.imu.stamp_ns, recording.temperature_c)
     corrected = compensate_samples(calibration, recording.imu, warm)
-    return CheckResult(prove_readings(data, recording.imu, corrected, gravity=gravity_of(calibration, options)), preflight.findings)
+    return CheckResult(prove_readings(data, recording.imu, corrected, gravity=gravity_of(calibration, options)), recording.findings)
 
 
 def gravity_of(calibration: Calibration, options: CalibrationOptions) -> float:

@@ -35,9 +35,9 @@ def run(options: Options) -> VerbResult:
     for topic in topics:
         open_bag(options.bag, topic, want_joints=False).close()
         blocks = source_of(options.bag, topic)()
-        preflight = Preflight()
-        imus.append(read_by_hand(blocks, watchers=[preflight]).imu)
-        warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(preflight.findings))
+        recording = read_by_hand(blocks, preflight=Preflight())
+        imus.append(recording.imu)
+        warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(recording.findings))
     first, second = imus
     result = estimate_arm(first, second)
     for axis, value, sd in zip('xyz', result.arm, result.arm_sd):

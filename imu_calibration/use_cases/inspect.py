@@ -94,12 +94,12 @@ def _look(bag, topics, table, options):
 def _by_hand(source, options, preflight):
     """Run the checks on a recording and return its calibration without a table, or the error."""
     try:
-        recording = read_by_hand(source(), options.nominal, [preflight])
-        if any(finding.severity == REFUSE for finding in preflight.findings):
+        recording = read_by_hand(source(), options.nominal, preflight)
+        if any(finding.severity == REFUSE for finding in recording.findings):
             return None
         asked = hand_options(options)
         data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
-        return hand_result(EvidentHand(solve_by_hand(data, asked)), recording, options, findings=preflight.findings)
+        return hand_result(EvidentHand(solve_by_hand(data, asked)), recording, options)
     except ImuCalibrationError as error:
         return error
 

@@ -50,9 +50,7 @@ def rate_error(found, truth, factor=1.0):
 
 
 def looked_at(imu):
-    preflight = Preflight(GRAVITY, strict=False)
-    read_by_hand([SampleBlock(imu)], watchers=[preflight])
-    return preflight.findings
+    return read_by_hand([SampleBlock(imu)], preflight=Preflight(GRAVITY, strict=False)).findings
 
 
 # a gyroscope at the wrong full-scale setting

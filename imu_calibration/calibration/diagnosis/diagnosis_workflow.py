@@ -172,9 +172,8 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
     DiagnosisResult
 
     """
-    preflight = Preflight(options.gravity)
-    recording = read_by_hand(source(), options.nominal, [preflight])
-    result, evident = evident_result(recording, replace(options, as_asked=False), provenance, findings=preflight.findings)
+    recording = read_by_hand(source(), options.nominal, Preflight(options.gravity))
+    result, evident = evident_result(recording, replace(options, as_asked=False), provenance)
     if evident.found is None:
         raise too_few_poses(len(evident.hand.poses.start))
     return DiagnosisResult(told_by_hand(evident.found, evident.hand), result.calibration, result.tolerances, result.needed,
