@@ -174,22 +174,21 @@ def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, place
         force, rate = placement.readings(*seen.values())
         readings = Readings(force, rate, ref.alpha_s @ placement.mat_ts.T, ref.temperature_c)
         made = target.corrected(numbers, readings)
-        lost = tuple(_lost(calibration, effect, target.holds, motion) for effect in effects.values()
-                     if effect not in estimated and not _whole(calibration, effect, target.holds))
+        parts = (_lost(calibration, effect, target.holds, motion) for effect in effects.values() if effect not in estimated)
+        lost = tuple(part for part in parts if part is not None)
     return Loss(lost, estimated, {s: _rms(m - t) for s, m, t in zip(SENSORS, made, true)},
                 {s: _rms(read[s] - t) for s, t in zip(SENSORS, (ref.force_s, ref.rate_s))}, motion.text)
 
 
-def _whole(calibration, effect, holds: tuple[affine.Capability, ...]):
-    values = calibration.values[calibration.model.slices[effect.key]]
-    return np.array_equal(affine.held_values(calibration, effect, affine.capability_of(effect, holds)), values)
-
-
 def _lost(calibration, effect, holds, motion):
-    """Return the part of the readings due to the part of an effect that is not represented."""
+    """Return the part of the readings due to the part of an effect that is not represented, None where the whole effect is."""
+    capability = affine.capability_of(effect, holds)
+    held = affine.held_values(calibration, effect, capability)
+    if np.array_equal(held, calibration.values[calibration.model.slices[effect.key]]):
+        return None
     model, values = invertible_values(calibration)
-    capability, less = affine.capability_of(effect, holds), values.copy()
-    less[model.slices[effect.key]] = affine.held_values(calibration, effect, capability)
+    less = values.copy()
+    less[model.slices[effect.key]] = held
     change = [sensor_output(model, effect.sensor, v, ref=motion.reference) for v in (values, less)]
     return LostEffect(effect, capability is not None, _rms(change[0] - change[1]))
 
