@@ -50,6 +50,8 @@ SAVED_TYPES: dict[str, Any] = {kind.__name__: kind for kind in (
     dict, tuple, Counter, Accumulator, WindowBlock, WindowStatistics, SensorStatistics, HeldOut, HeldOutBlock, JointNames,
     ModelChanges, ModelExtension)}
 """Types that an archive may contain, in addition to arrays and plain values."""
+MOST_SAVED = 10**7
+"""Values of a column at most: a damaged header may state any number of empty ones."""
 
 
 def to_bytes(gathered: SessionData, model: SensorModel, extension: ModelExtension = ModelExtension()) -> bytes:
@@ -111,6 +113,8 @@ def _unpacked(column, numbers):
     name, size, *parts = column
     if name == 'plain':
         return size
+    if name not in ('list', 'mixed') and (size[0] if name == 'array' else size) > MOST_SAVED:
+        raise ValueError(f'a column must have at most {MOST_SAVED} values, got {size}')
     if name == 'array':
         return list(np.frombuffer(numbers.read(8 * math.prod(size))).reshape(size))
     if name == 'list':

@@ -352,9 +352,9 @@ class LiveCalibration:
 
     def _residual(self, window):
         every = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
-        some = window.select(slice(every // 2 if len(window) > every // 2 else 0, None, every))
-        residuals = self.result.residuals_of(some)
-        return ImuSamples(some.stamp_ns, *(residuals[sensor] for sensor in SENSORS), self._collector.gathered.frame_id)
+        some = slice(every // 2 if len(window) > every // 2 else 0, None, every)
+        residuals = self.result.residuals_of(window)   # of all samples: a lag interpolates between them
+        return ImuSamples(window.stamp_ns[some], *(residuals[sensor][some] for sensor in SENSORS), self._collector.gathered.frame_id)
 
     def coverage(self) -> Coverage:
         """Return the Coverage: which attitudes are worth having, which motion helps most."""

@@ -12,9 +12,7 @@ from imu_calibration.calibration.table_calibration import calibrate, conclude, s
 from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.document.decision import HELPS
-from imu_calibration.effects import forward_equations
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.references.options import CalibrationOptions
@@ -266,15 +264,10 @@ def test_residuals_are_what_the_model_leaves(quick):
     assert set(residuals.stamp_ns) <= set(quick[0].stamp_ns)
 
 
-def test_residuals_need_the_motion_of_the_published_samples_only(quick, monkeypatch):
-    """Published residuals evaluated the kinematics of each window, which its columns need too, a second time at every sample."""
-    live, rows = LiveCalibration(TABLE, settings=LiveSettings(residual_rate=10.0)), []
-    windows = run(live, *quick)
-    live.solve(pending=True)
-    monkeypatch.setattr(forward_equations, 'reference_motion',
-                        lambda table, motion, *further, **options: rows.append(len(motion)) or reference_motion(table, motion, *further, **options))
-    residuals = live.residuals(windows)
-    assert sum(rows) <= 2 * len(residuals)   # for each sensor, or once for both
+@pytest.mark.parametrize('column', [['array', [10**12, 0]], ['dict', 10**12, [], ['plain', []]]])
+def test_a_column_of_more_values_than_any_session_has_is_refused(column):
+    with pytest.raises(ValueError, match='at most'):
+        collector._unpacked(column, None)
 
 
 def test_windows_of_one_kind_are_saved_in_common_columns(quick):
