@@ -63,6 +63,18 @@ def decompression_errors() -> tuple[type[Exception], ...]:
     return zstd().ZstdError, RuntimeError, EOFError, OSError, ValueError
 
 
+def decompress_chunk(compression: str, packed: memoryview, size: int) -> bytes:
+    """Return the content of a chunk, at most the `size` bytes that its header declares, or its readable part (raises ValueError)."""
+    if size > LARGEST_CHUNK:
+        raise ValueError(f'a chunk of {size} bytes, more than the {LARGEST_CHUNK} that are accepted')
+    try:
+        return decompress(compression, packed, size)
+    except KeyError:
+        raise ValueError(f'a chunk with the unknown compression {compression!r}') from None
+    except decompression_errors() as error:
+        raise ValueError(f'a chunk that cannot be decompressed ({error})') from error
+
+
 def decompress_message(data: bytes) -> bytes:
     """Return one message of a bag that is compressed by message (raises ValueError for one that expands too much)."""
     limit = min(LARGEST_MESSAGE, MESSAGE_BASE + FILE_RATIO * len(data))

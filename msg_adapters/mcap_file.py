@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from imu_calibration.core.documents import open_regular
-from msg_adapters.compression import LARGEST_CHUNK, decompress, decompression_errors, largest_content
+from msg_adapters.compression import decompress_chunk, largest_content
 from msg_adapters.layout import Packed, clean_name, overlapping
 from msg_adapters.storage import StorageFile, Stretch, read_ahead
 
@@ -110,23 +110,14 @@ def unpack_chunk(content: memoryview) -> tuple[bytes | memoryview, bool]:
     except (struct.error, UnicodeDecodeError):
         raise McapDamage('a chunk without its header') from None
     packed = content[40 + length:40 + length + packed_size]
-    records = packed if compression == '' else _decompressed(compression, packed, size)
+    try:
+        records = packed if compression == '' else decompress_chunk(compression, packed, size)
+    except ValueError as error:
+        raise McapDamage(str(error)) from error
     whole = len(records) == size and len(packed) == packed_size
     if whole and crc and zlib.crc32(records) != crc:
         raise McapDamage('a chunk whose checksum does not fit')
     return records, whole
-
-
-def _decompressed(compression: str, packed: memoryview, size: int) -> bytes:
-    """Return the content of a chunk, at most the `size` bytes that its header declares, or its readable part (raises McapDamage)."""
-    if size > LARGEST_CHUNK:
-        raise McapDamage(f'a chunk of {size} bytes, more than the {LARGEST_CHUNK} that are accepted')
-    try:
-        return decompress(compression, packed, size)
-    except KeyError as error:
-        raise McapDamage(f'a chunk with the unknown compression {compression!r}') from error
-    except decompression_errors() as error:
-        raise McapDamage(f'a chunk that cannot be decompressed ({error})') from error
 
 
 def indexed_messages(buffer: np.ndarray, indexes: Sequence[tuple[float, np.ndarray]]) -> tuple[np.ndarray, Packed] | None:
