@@ -63,6 +63,8 @@ def outcome(search, named, rest):
 @pytest.mark.parametrize(('rest', 'remaining', 'found'), ((0.0, -1.0, set()), (50.0, -1.0, set(NAMES[:2])), (50.0, 10.0, set())),
                          ids=('nothing to explain', 'a pair explains it', 'a pair leaves a fifth'))
 def test_pairs_are_tested_for_a_remaining_excess(monkeypatch, rest, remaining, found):
-    search = searched((1.0, 0.6, -0.6, 0.0, 0.0), 0.95)
+    search, tested = searched((1.0, 0.6, -0.6, 0.0, 0.0), 0.95), []
+    monkeypatch.setattr(investigation, 'best_pairs', lambda search: tested.append(search) or best_pairs(search))
     monkeypatch.setattr(investigation, '_settled', lambda linearised_at, problem, chosen: outcome(search, chosen, remaining))
     assert names(investigation._looked_again(outcome(search, [], rest), None, False, set()).named) == found
+    assert bool(tested) == bool(rest)   # their search takes long
