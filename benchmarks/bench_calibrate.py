@@ -52,13 +52,13 @@ def bench_calibrate(minutes=MINUTES, repetitions=REPETITIONS):
         for storage, limit in LIMITS.items():
             long_bag = write_bench_bag(Path(folder, f'long_{storage}'), minutes, storage, session=session)
             short_bag = write_bench_bag(Path(folder, f'short_{storage}'), minutes / GROWTH, storage, session=short)
-            rows += _measure(long_bag, short_bag, storage, limit, repetitions, Path(folder, 'result'))
+            rows += _measure(long_bag, short_bag, storage, limit, repetitions)
     return rows
 
 
-def _measure(long_bag, short_bag, storage, limit, repetitions, output):
+def _measure(long_bag, short_bag, storage, limit, repetitions):
     iterate(long_bag)   # reads the file into the page cache, so that both find it there
-    runs = [(iterate(long_bag), *calibrate(long_bag, output), *calibrate(short_bag, output)) for _ in range(repetitions)]
+    runs = [(iterate(long_bag), *calibrate(long_bag), *calibrate(short_bag)) for _ in range(repetitions)]
     bare, long, long_mb, short, short_mb = (median(column) for column in zip(*runs, strict=True))
     return [
         Row(f'calibrate against bare iteration, {storage}', median(run[1] / run[0] for run in runs), 'x', limit, f'{long:.1f} s against {bare:.1f} s'),
@@ -67,10 +67,10 @@ def _measure(long_bag, short_bag, storage, limit, repetitions, output):
     ]
 
 
-def calibrate(bag, output):
-    """Return (processor seconds, peak memory in MB) of calibrating a bag without a report."""
+def calibrate(bag):
+    """Return (processor seconds, peak memory in MB) of calibrating a bag into a folder beside it, without a report."""
     return run_verb([sys.executable, '-m', 'imu_calibration', 'calibrate', str(bag), '--table', str(config_file('table_simulated.yaml')),
-                     '--output', str(output), '--no-report'])
+                     '--output', f'{bag}_result', '--no-report'])
 
 
 def main():
