@@ -95,11 +95,16 @@ def cycles(graph):
     return found
 
 
-def excess(rows, loops):
-    """Return a line for each limit that is exceeded by files, path -> row of `weigh`, with these cycles."""
-    weights = (len(rows), *(sum(row[k] for row in rows.values()) for k in (0, 1)), max(row[4] for row in rows.values()), len(loops))
-    return [f'{name} must be at most {most}, got {weight}; replace or generalise code'
-            for (name, most), weight in zip(LIMITS.items(), weights, strict=True) if weight > most]
+def weights_of(rows, loops):
+    """Return the weights that have LIMITS, from the rows of `weigh` of all files and the cycles."""
+    lines, tokens, _, _, raw = zip(*rows)
+    return dict(zip(LIMITS, (len(rows), sum(lines), sum(tokens), max(raw), len(loops)), strict=True))
+
+
+def excess(weights):
+    """Return a line for each limit that is exceeded."""
+    return [f'{name} must be at most {most}, got {weights[name]}; replace or generalise code'
+            for name, most in LIMITS.items() if weights[name] > most]
 
 
 def main():
@@ -117,17 +122,17 @@ def main():
         package = packages['/'.join(folders[:2])]
         package[0] += 1
         package[1] += row[0]
-    total = [sum(row[k] for row in rows.values()) for k in range(4)]
     loops = cycles(imports(root, files))
+    weights = weights_of(rows.values(), loops)
     if options.packages:
         for name, (count, lines) in sorted(packages.items(), key=lambda each: -each[1][1]):
             print(f'  {name:34s} {count:4d} files {lines:6d} code lines')
         for loop in loops:
             print('  cycle: ' + ', '.join(loop))
-    print(f'files {len(files)}, code lines {total[0]}, tokens {total[1]}, functions {total[2]}, classes {total[3]}, '
-          f'files above 320 raw lines {sum(row[4] > 320 for row in rows.values())}, below 50 {sum(row[4] < 50 for row in rows.values())}, '
-          f'cycles {len(loops)}')
-    if lines := excess(rows, loops):
+    functions, classes, raw = list(zip(*rows.values()))[2:]
+    print(f'{", ".join(f"{name} {weight}" for name, weight in weights.items())}, functions {sum(functions)}, classes {sum(classes)}, '
+          f'files above 320 raw lines {sum(n > 320 for n in raw)}, below 50 {sum(n < 50 for n in raw)}')
+    if lines := excess(weights):
         sys.exit('\n'.join(lines))
 
 
