@@ -5,7 +5,6 @@ import itertools
 
 import numpy as np
 from papers import avrutov2017 as avrutov
-from papers import avrutov2017 as avrutov_budget
 from papers.linear_least_squares import condition_numbers, null_directions, numerical_rank
 
 from imu_calibration.core.errors import NotObservableError
@@ -101,13 +100,13 @@ def print_gyro_series():
 def print_budget():
     heading('Error budget of sample 1 (section V): 0.1 mV, level 2 arcmin, encoder 1.5 arcsec; worst sensor, mV and mV/g')
     truth, mat_bn = avrutov.nominal_accelerometers('linear'), avrutov.turn('ZYX', [ANGLES] * 3)
-    budget = avrutov_budget.error_budget(
-        readings(), truth, 'linear', noise_sd=1e-4, common={'levelling': avrutov_budget.tilt_changes(mat_bn, 'z', TILT)},
-        scattered={'encoder': avrutov_budget.encoder_changes('ZYX', np.tile(ANGLES, (3, 1)), 'z', encoder_sd_rad=ENCODER)})
+    budget = avrutov.error_budget(
+        readings(), truth, 'linear', noise_sd=1e-4, common={'levelling': avrutov.tilt_changes(mat_bn, 'z', TILT)},
+        scattered={'encoder': avrutov.encoder_changes('ZYX', np.tile(ANGLES, (3, 1)), 'z', encoder_sd_rad=ENCODER)})
     for cause, sd in budget.items():
         print(f'{cause:14s}' + ''.join(f'   {name} {1e3 * np.max(row):.4f}' for name, row in zip(avrutov.MODEL_COLUMNS['linear'], sd)))
     tilted = avrutov.design_matrix(avrutov.gravity_readings(mat_bn, 'z', (TILT, 0))) @ truth
-    solution = avrutov_budget.calibrate_with_tilt(mat_bn, tilted, 'z')
+    solution = avrutov.calibrate_with_tilt(mat_bn, tilted, 'z')
     print(f'levelling estimated with the three sensors jointly: rank {len(solution.linear.param_names)} of 14, '
           f'largest error {np.max(np.abs(solution.coefficients - truth)):.1e} V/g, tilt {60 * np.rad2deg(solution.tilt_rad[0]):.6f} arcmin')
 
@@ -115,14 +114,14 @@ def print_budget():
 def print_section_5():
     tests, noise_sd, truth = 2000, 1e-3, avrutov.nominal_accelerometers('linear')
     heading(f'Section V as printed: X = B U (eq. 13), {tests} tests of sample 1 with 1 mV of output noise; sd in mV and mV/g')
-    operator, design = avrutov_budget.estimation_operator(readings()), avrutov.design_matrix(readings())
+    operator, design = avrutov.estimation_operator(readings()), avrutov.design_matrix(readings())
     outputs = design @ truth + noise_sd * np.random.default_rng(3).normal(size=(tests, len(design), 3))
     errors = operator @ outputs - truth
-    rows = {'1/(m-1), printed': avrutov_budget.m_test_sd(errors), '1/m': avrutov_budget.m_test_sd(errors, as_printed=False),
+    rows = {'1/(m-1), printed': avrutov.m_test_sd(errors), '1/m': avrutov.m_test_sd(errors, as_printed=False),
             "sigma sqrt(diag BB')": np.repeat(noise_sd * np.linalg.norm(operator, axis=1)[:, None], 3, axis=1)}
     for title, sd in rows.items():
         print(f'{title:22s}' + ''.join(f'   {name}{"".join(f"{1e3 * one:8.4f}" for one in row)}' for name, row in zip(avrutov.MODEL_COLUMNS['linear'], sd)))
-    few = avrutov_budget.m_test_sd(errors[:5]) / avrutov_budget.m_test_sd(errors[:5], as_printed=False)
+    few = avrutov.m_test_sd(errors[:5]) / avrutov.m_test_sd(errors[:5], as_printed=False)
     print(f'B is {operator.shape[0]} x {operator.shape[1]}, not n x 4; with five tests 1/(m-1) is {100 * (few.mean() - 1):.0f} % too large, for the truth is '
           'known and no mean was estimated')
 
@@ -163,7 +162,7 @@ def findings():
     yield f"Sample 4 turns the y axis at {series[:, 1].max():.0f} deg/s at most, and below Earth rate in {quiet} of {len(series)} runs."
     linear = avrutov.nominal_gyroscopes('linear')
     sensed = avrutov.add_earth_rate(avrutov.series_3(), EARTH_RATE)
-    ignored = avrutov_budget.reference_error(avrutov.series_3(), sensed - avrutov.series_3(), linear)
+    ignored = avrutov.reference_error(avrutov.series_3(), sensed - avrutov.series_3(), linear)
     yield f'Earth rate is not in the model: in Kyiv it puts {np.max(np.abs(ignored[1:])):.2e} V/(deg/s) into sample 3.'
     mat_bn = avrutov.turn('ZYX', [ANGLES] * 3)
     nominal = avrutov.nominal_accelerometers()

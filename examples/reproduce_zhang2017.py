@@ -3,7 +3,6 @@
 
 import numpy as np
 from papers import zhang2017 as zhang
-from papers import zhang2017 as zhang_claims
 from papers.zhang2017_joint_fit import (
     DESIGNS,
     arm_errors,
@@ -145,7 +144,7 @@ def print_designs():
 def print_static_navigation(rng):
     heading('Figures 6 and 7, 50 s at rest after six-position calibration (printed: 4 -> 0.02 m/s, 100 -> 0.3 m)')
     for drift in (0.0, 0.02, 0.05, 0.1, 0.75):
-        v0, p0, v1, p1 = zhang_claims.static_navigation(TABLE, 1e-3 * drift, rng, n_draws=200)
+        v0, p0, v1, p1 = zhang.static_navigation(TABLE, 1e-3 * drift, rng, n_draws=200)
         print(f'bias drift between runs {drift:4.2f} mg: {v0:.2f} -> {v1:.3f} m/s ({v0 / v1:5.1f}x), {p0:.0f} -> {p1:.2f} m '
               f'({p0 / p1:5.1f}x)')
 
@@ -153,7 +152,7 @@ def print_static_navigation(rng):
 def print_spins():
     heading('Constant spins at 100 deg/s with Table 3 uncompensated: summed in the body frame | navigated in the level frame')
     for axis, seconds in (((1, 0, 0), 100), ((0, 1, 0), 100), ((0, 0, 1), 100), ((1, 1, 1), 60), ((1, 1, 0), 60), ((1, -1, 1), 60)):
-        growth = zhang_claims.spin_growth(SENSOR.cosines, ARMS, axis, seconds=seconds)
+        growth = zhang.spin_growth(SENSOR.cosines, ARMS, axis, seconds=seconds)
         (body_v, body_p), (level_v, level_p) = ([strapdown.largest(part) for part in growth[key]] for key in ('body', 'level'))
         print(f'axis {axis!s:11s} {seconds:3d} s: {body_v:5.2f} m/s {body_p:6.1f} m | {level_v:6.3f} m/s {level_p:6.2f} m, '
               f'steady along the axis {growth["axial_mg"]:+.3f} mg')
@@ -165,10 +164,10 @@ def print_tumbling(rng):
     errors = {design: np.stack([arm_errors(design_runs(design), *pair, rng=rng, n_draws=300) for pair in zip(SENSOR.cosines, ARMS)], axis=1)
               for design in DESIGNS}
     for amplitude, frequency in motions:
-        responses = zhang_claims.arm_responses(zhang_claims.tumble(amplitude, frequency, sample_rate=100.0), SENSOR.cosines)
-        plain = zhang_claims.peaks(responses, ARMS)
-        diagonal = zhang_claims.peaks(responses, np.where(OFF_AXIS, ARMS, 0.0))
-        gains = {design: np.median(plain[0] / zhang_claims.peaks(responses, wrong)[0]) for design, wrong in errors.items()}
+        responses = zhang.arm_responses(zhang.tumble(amplitude, frequency, sample_rate=100.0), SENSOR.cosines)
+        plain = zhang.peaks(responses, ARMS)
+        diagonal = zhang.peaks(responses, np.where(OFF_AXIS, ARMS, 0.0))
+        gains = {design: np.median(plain[0] / zhang.peaks(responses, wrong)[0]) for design, wrong in errors.items()}
         print(f'{amplitude} deg, {frequency} Hz: {plain[0, 0]:.2f} m/s {plain[1, 0]:.0f} m; on-axis arms only '
               f'{plain[0, 0] / diagonal[0, 0]:.1f}x; ' + ', '.join(f'{design} {gain:.2f}x' for design, gain in gains.items()))
 
@@ -215,7 +214,7 @@ def findings():
     equilibrated = np.linalg.cond(jacobian(design_runs('Z0'), TRUTH[0]) / np.linalg.norm(jacobian(design_runs('Z0'), TRUTH[0]), axis=0))
     yield f'An equilibrated condition number does not see this ({equilibrated:.1f} for Zhang\'s design); tolerances do.'
     acceleration = np.deg2rad(100) ** 2 * 0.01
-    growth = zhang_claims.spin_growth(SENSOR.cosines, ARMS, (1, 0, 0))
+    growth = zhang.spin_growth(SENSOR.cosines, ARMS, (1, 0, 0))
     yield (f'"3 m/s and 150 m in 100 s" is {100 * acceleration:.2f} m/s and {5000 * acceleration:.0f} m by arithmetic, but the error turns '
            f'with the body: with Table 3 it stays below {strapdown.largest(growth["level"][0]):.3f} m/s and '
            f'{strapdown.largest(growth["level"][1]):.1f} m.')

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 from papers import zhang2017 as zhang
-from papers import zhang2017 as zhang_claims
 from papers import zhang2017_joint_fit as zhang_designs
-from papers import zhang2017_joint_fit as zhang_joint
 from refusal import refused
 from scipy.spatial.transform import Rotation
 
@@ -63,7 +61,7 @@ def test_dead_reckoning_of_constant_and_circular_motion():
 
 
 def test_drift_is_zero_for_perfect_samples_and_follows_one_fault():
-    motion = zhang_claims.tumble((20, 20, 20), (0.3, 0.4, 0.5), seconds=20, sample_rate=100)
+    motion = zhang.tumble((20, 20, 20), (0.3, 0.4, 0.5), seconds=20, sample_rate=100)
     reference = reference_of(motion)
     assert not np.any(strapdown.dead_reckoning_errors(reference, reference.force_s, reference.rate_s))
     still = Reference(np.arange(0, 100.01, 0.01), np.tile(np.eye(3), (10001, 1, 1)), np.tile([0, 0, G], (10001, 1)),
@@ -80,7 +78,7 @@ def test_wrong_times_are_refused():
 
 
 def test_n1_static_navigation_without_drift():
-    v0, p0, v1, p1 = zhang_claims.static_navigation(MODEL, 0.0, np.random.default_rng(11))
+    v0, p0, v1, p1 = zhang.static_navigation(MODEL, 0.0, np.random.default_rng(11))
     show('N1', '50 s, no drift: before m/s, m', [v0, p0], '7.78 195')
     show('N1', 'after m/s, m', [v1, p1], '<= 0.016 0.45')
     show('N1', 'ratio', [v0 / v1, p0 / p1], '>= 450 (592/540)')
@@ -89,7 +87,7 @@ def test_n1_static_navigation_without_drift():
 
 
 def test_n1_static_navigation_with_the_sensors_own_drift():
-    v0, p0, v1, p1 = zhang_claims.static_navigation(MODEL, 0.75e-3, np.random.default_rng(12))
+    v0, p0, v1, p1 = zhang.static_navigation(MODEL, 0.75e-3, np.random.default_rng(12))
     show('N1', '50 s, 0.75 mg drift: after m/s, m, ratio', [v1, p1, v0 / v1], '0.73 18 8-14')
     assert 8 <= v0 / v1 <= 14 and 8 <= p0 / p1 <= 14
 
@@ -102,7 +100,7 @@ def test_n1_table_2_explains_the_printed_curve():
 
 
 def test_n2_a_spin_about_a_body_axis_does_not_drift():
-    growth = zhang_claims.spin_growth(COSINES, ARMS, (1, 0, 0))
+    growth = zhang.spin_growth(COSINES, ARMS, (1, 0, 0))
     level, body = strapdown.largest(growth['level'][0]), strapdown.largest(growth['body'][0])
     show('N2', 'x spin 100 deg/s, 100 s: level frame, body sum, m/s', [level, body], '0.048 3.69 (+-2 %)')
     show('N2', 'positions, m', [strapdown.largest(growth['level'][1]), strapdown.largest(growth['body'][1])], '2.4 185')
@@ -110,7 +108,7 @@ def test_n2_a_spin_about_a_body_axis_does_not_drift():
 
 
 def test_n2_a_spin_about_the_diagonal_does():
-    growth = zhang_claims.spin_growth(COSINES, ARMS, (1, 1, 1), seconds=60.0)
+    growth = zhang.spin_growth(COSINES, ARMS, (1, 1, 1), seconds=60.0)
     end = [float(np.linalg.norm(part[-1])) for part in growth['level']]
     show('N2', '(1,1,1) spin 60 s: axial mg, m/s, m', [growth['axial_mg'], *end], '2.717 1.60 48.0')
     assert abs(growth['axial_mg']) == pytest.approx(2.717, abs=2e-3)
@@ -118,12 +116,12 @@ def test_n2_a_spin_about_the_diagonal_does():
 
 
 def test_n3_tumbling_uncompensated_and_with_arms_estimated_without_noise():
-    responses = zhang_claims.arm_responses(zhang_claims.tumble((60, 45, 30), (0.7, 0.9, 1.1)), COSINES)
-    velocity, position = zhang_claims.peaks(responses, ARMS)[:, 0]
+    responses = zhang.arm_responses(zhang.tumble((60, 45, 30), (0.7, 0.9, 1.1)), COSINES)
+    velocity, position = zhang.peaks(responses, ARMS)[:, 0]
     runs, sensors = zhang_designs.design_runs('M'), np.column_stack([np.zeros(3), COSINES, ARMS])
-    estimated = zhang_joint.fit_triad(runs, np.column_stack([zhang_joint.predict(runs, sensor) for sensor in sensors]))[1]
-    exact = zhang_claims.peaks(responses, estimated - ARMS)[0, 0]
-    nearly = zhang_claims.peaks(responses, estimated - ARMS * (1 + 1e-6))[0, 0]
+    estimated = zhang_designs.fit_triad(runs, np.column_stack([zhang_designs.predict(runs, sensor) for sensor in sensors]))[1]
+    exact = zhang.peaks(responses, estimated - ARMS)[0, 0]
+    nearly = zhang.peaks(responses, estimated - ARMS * (1 + 1e-6))[0, 0]
     show('N3', 'uncompensated m/s, m', [velocity, position], '5.256 179.6 (+-0.5 %)')
     show('N3', 'arms estimated without noise, m/s', exact, '< 1e-9')
     assert (velocity, position) == (pytest.approx(5.256, rel=5e-3), pytest.approx(179.6, rel=5e-3))
@@ -135,9 +133,9 @@ def test_n3_tumbling_with_estimated_arms(design, wanted):
     """300 draws of the arms from the design's full covariance, 0.1 mg means."""
     rng = np.random.default_rng(13)
     runs = zhang_designs.design_runs(design)
-    responses = zhang_claims.arm_responses(zhang_claims.tumble((60, 45, 30), (0.7, 0.9, 1.1)), COSINES)
-    wrong = np.stack([zhang_joint.arm_errors(runs, COSINES[i], ARMS[i], rng=rng, n_draws=300) for i in range(3)], axis=1)
-    gains = zhang_claims.peaks(responses, ARMS)[:, :1] / zhang_claims.peaks(responses, wrong)
+    responses = zhang.arm_responses(zhang.tumble((60, 45, 30), (0.7, 0.9, 1.1)), COSINES)
+    wrong = np.stack([zhang_designs.arm_errors(runs, COSINES[i], ARMS[i], rng=rng, n_draws=300) for i in range(3)], axis=1)
+    gains = zhang.peaks(responses, ARMS)[:, :1] / zhang.peaks(responses, wrong)
     velocity, position = np.median(gains, axis=1)
     show('N3', f'{design}: median improvement, velocity, position', [velocity, position], wanted)
     low, high = {'M': (100, 200), 'O': (80, 160), 'Z60': (25, 60), 'Z0': (0, 3)}[design]

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from papers import avrutov2017 as avrutov
-from papers import avrutov2017 as avrutov_budget
 from papers.linear_least_squares import (
     condition_numbers,
     null_directions,
@@ -213,7 +212,7 @@ def test_a9_earth_rate_on_sample_3():
     show('A9', 'error ignored | modelled, V/(deg/s)', [ignored, modelled], '2.476e-4 +-1 % | < 1e-12')
     assert ignored == pytest.approx(2.476e-4, rel=0.01)
     assert modelled < 1e-12
-    predicted = avrutov_budget.reference_error(rates, sensed - rates, truth)
+    predicted = avrutov.reference_error(rates, sensed - rates, truth)
     np.testing.assert_allclose(predicted, avrutov.calibrate(rates, outputs).values - truth, atol=1e-15)
 
 
@@ -228,7 +227,7 @@ def test_a10_table_tilt(order, expected):
         outputs = avrutov.design_matrix(avrutov.gravity_readings(mat_bn, 'z', tilt)) @ truth
         ignored.append(np.max(np.abs(avrutov.calibrate(level, outputs).values - truth)))
         if len(ignored) % 18 == 1:
-            solution = avrutov_budget.calibrate_with_tilt(mat_bn, outputs, 'z')
+            solution = avrutov.calibrate_with_tilt(mat_bn, outputs, 'z')
             estimated.append(max(np.max(np.abs(solution.coefficients - truth)), np.max(np.abs(solution.tilt_rad - tilt))))
     show('A10', f'{order} g//z: worst error ignored, mV or mV/g', 1e3 * max(ignored), expected)
     show('A10', f'{order} g//z: error with two tilt parameters', max(estimated), '< 1e-12')
@@ -252,9 +251,9 @@ def test_error_budget_is_the_scatter_of_simulated_causes():
     rng = np.random.default_rng(10)
     order, axis, truth = 'ZYX', 'z', avrutov.nominal_accelerometers('linear')
     mat_bn, level = avrutov.turn(order, [ANGLES] * 3), readings(order, axis)
-    common = {'tilt': avrutov_budget.tilt_changes(mat_bn, axis, TILT), 'gravity': 3e-5 * level}
-    scattered = {'encoder': avrutov_budget.encoder_changes(order, np.tile(ANGLES, (3, 1)), axis, encoder_sd_rad=1e-4)}
-    budget = avrutov_budget.error_budget(level, truth, 'linear', noise_sd=1e-4, common=common, scattered=scattered)
+    common = {'tilt': avrutov.tilt_changes(mat_bn, axis, TILT), 'gravity': 3e-5 * level}
+    scattered = {'encoder': avrutov.encoder_changes(order, np.tile(ANGLES, (3, 1)), axis, encoder_sd_rad=1e-4)}
+    budget = avrutov.error_budget(level, truth, 'linear', noise_sd=1e-4, common=common, scattered=scattered)
 
     def scatter(make_outputs):
         outputs = np.concatenate([make_outputs() for _ in range(3000)], axis=1)
@@ -282,10 +281,10 @@ def test_unknown_model_is_refused():
 def test_section_5_as_printed():
     """Eq. 13 is the fit, the m tests scatter as sigma sqrt(diag BB'), and dividing by m - 1 with the truth known is too large."""
     inputs, truth = avrutov.gravity_readings(avrutov.turn('ZYX', [ANGLES] * 3), 'z'), avrutov.nominal_accelerometers('linear')
-    operator, design = avrutov_budget.estimation_operator(inputs), avrutov.design_matrix(inputs)
+    operator, design = avrutov.estimation_operator(inputs), avrutov.design_matrix(inputs)
     np.testing.assert_allclose(operator @ (design @ truth), truth, atol=1e-12)
     assert operator.shape == (4, len(inputs))
     errors = operator @ (1e-3 * np.random.default_rng(5).normal(size=(3000, len(inputs), 3)))
     wanted = 1e-3 * np.linalg.norm(operator, axis=1)[:, None]
-    assert np.max(np.abs(avrutov_budget.m_test_sd(errors, as_printed=False) / wanted - 1)) < 0.05
-    np.testing.assert_allclose(avrutov_budget.m_test_sd(errors[:5])**2, 1.25 * avrutov_budget.m_test_sd(errors[:5], as_printed=False)**2)
+    assert np.max(np.abs(avrutov.m_test_sd(errors, as_printed=False) / wanted - 1)) < 0.05
+    np.testing.assert_allclose(avrutov.m_test_sd(errors[:5])**2, 1.25 * avrutov.m_test_sd(errors[:5], as_printed=False)**2)
