@@ -32,7 +32,7 @@ class ModelChanges:
 
     added: tuple[str, ...] = ()
     """Added to the model because the data support them."""
-    denied: tuple[str, ...] = ()
+    unstable: tuple[str, ...] = ()
     """Not added because the estimates of parts of the recording differ; the standard deviations allow for them."""
     implausible: dict[str, float] = field(default_factory=dict)
     """
@@ -48,7 +48,8 @@ class ModelChanges:
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items() if value}
+        return {{'unstable': 'denied'}.get(name, name): list(value) if isinstance(value, tuple) else value
+                for name, value in vars(self).items() if value}
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,7 +113,7 @@ def _faint(hand, found, asked):
 
 
 def extended_by_hand(data: HandData, found: 'HandInvestigation', options: HandOptions) -> HandCalibration:
-    """Return the calibration with the requested model and the findings; denied or implausible effects increase its covariance."""
+    """Return the calibration with the requested model and the findings; unstable or implausible effects increase its covariance."""
     asked, names = _asked(data, options), found.names
     extended = replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS})
     hand = solve_by_hand(data, extended, found.point(found.problem, found.named))

@@ -27,7 +27,7 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Options) -> VerbResult:
     """Compensate into a new bag, print warnings and losses, return the exit code."""
     from imu_calibration.use_cases.compensate import compensate
-    found = compensate(options.bag, **options.named_as(compensate))
+    found = compensate(options.bag, **options.arguments_for(compensate))
     for line in found.warnings:
         print_line(f'note: {line}')
     print_line(f'written: {options.output} with {options.corrected_topic} ({found.count} samples)')

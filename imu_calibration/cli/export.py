@@ -31,7 +31,7 @@ def run(options: Options) -> VerbResult:
         raise InputError('a table or arm needs the recording --bag BAG, none was given; give both')
     from imu_calibration.use_cases.choices import topics_of
     from imu_calibration.use_cases.exporting import export_calibration
-    found = export_calibration(options.document, stand=stand, topics=topics_of(vars(options)), **options.named_as(export_calibration))
+    found = export_calibration(options.document, stand=stand, topics=topics_of(vars(options)), **options.arguments_for(export_calibration))
     for line in (*found.lines, f'written: {options.output}'):
         print_line(line)
     return VerbResult(found.exit_code, {'output': options.output, 'lines': found.lines})

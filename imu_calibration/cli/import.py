@@ -17,7 +17,7 @@ def run(options: Options) -> VerbResult:
     """Read, write, and list the parameters that the file lacks."""
     from imu_calibration.estimation.solution import HELD
     from imu_calibration.use_cases.exporting import import_calibration
-    found = import_calibration(options.file, **options.named_as(import_calibration))
+    found = import_calibration(options.file, **options.arguments_for(import_calibration))
     held = [name for name, status in found.requested.items() if status == HELD]
     for sensor, word in found.decisions.items():
         print_line(': '.join([f'{sensor} {word}', *filter(None, [found.decision_reasons.get(sensor)])]))

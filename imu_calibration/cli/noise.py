@@ -26,7 +26,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.document import files
     from imu_calibration.use_cases.noise import noise
     with files.output_folder(options.output) as folder:
-        found = noise(options.bag, **{name: value for name, value in options.named_as(noise).items() if value is not None})
+        found = noise(options.bag, **{name: value for name, value in options.arguments_for(noise).items() if value is not None})
         for warning in found.warnings:
             complain(f'warning: {warning}')
         found.save(folder, report=not options.no_report)

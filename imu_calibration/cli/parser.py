@@ -156,8 +156,8 @@ class Options(argparse.Namespace):
             from imu_calibration.use_cases.choices import provenance_with, require_same_inputs
             require_same_inputs(self.output, provenance_with(self.verb, bags, self.choices(), stand=self.stand()))
 
-    def named_as(self, function: Callable) -> dict[str, Any]:
-        """Return those that have the names of parameters of a function."""
+    def arguments_for(self, function: Callable) -> dict[str, Any]:
+        """Return the options whose names are parameters of a function."""
         return {name: value for name, value in vars(self).items() if name in signature(function).parameters}
 
 

@@ -39,7 +39,7 @@ def run(options: Options) -> VerbResult:
     """Simulate and write."""
     from imu_calibration.use_cases.simulate import replay, simulate
     if options.replay is None:
-        made = simulate(**options.named_as(simulate) | {'effects': options.effect, 'table': options.stand()})
+        made = simulate(**options.arguments_for(simulate) | {'effects': options.effect, 'table': options.stand()})
     else:
         if options.calibration is None:
             raise InputError('--replay requires the IMU to simulate, no calibration was given; add --calibration FILE', key='calibration',

@@ -142,7 +142,7 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
         raise InputError('a replay needs the motion of the IMU, no table or arm was given; give one (by hand only the gyroscope '
                          'measures the turns)', key='table', code='replay_by_hand')
     _, given, (source,) = inputs_of([recording], table, choices)
-    assert given is not None   # it is for a stand
+    assert given is not None   # because a table or arm is given
     known = files.given_calibration(calibration)
     require_joints(known.model, given)
     noise = None

@@ -11,7 +11,7 @@ from refusal import refused
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
-from imu_calibration.calibration.diagnosis.findings import told_by_hand
+from imu_calibration.calibration.diagnosis.findings import diagnosis_by_hand
 from imu_calibration.calibration.hand_workflow import extended_by_hand, solve_by_evidence
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
@@ -54,7 +54,7 @@ def diagnose_by_hand(data, options):
     """The findings and the extended calibration."""
     found = investigate_by_hand(data, options)
     hand = extended_by_hand(data, found, options)
-    return SimpleNamespace(diagnosis=told_by_hand(found, hand), hand=hand, search=found)
+    return SimpleNamespace(diagnosis=diagnosis_by_hand(found, hand), hand=hand, search=found)
 
 
 def diagnosed(seed, spoil=None, n_poses=24, **options):

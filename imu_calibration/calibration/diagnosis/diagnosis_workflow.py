@@ -9,7 +9,7 @@ import numpy as np
 from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, formula_gain, to_mapping
-from imu_calibration.calibration.diagnosis.findings import DISAGREED, LEAVES_MOST, build_diagnosis, told_by_hand
+from imu_calibration.calibration.diagnosis.findings import DISAGREED, LEAVES_MOST, build_diagnosis, diagnosis_by_hand
 from imu_calibration.calibration.diagnosis.traces import residual_traces
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.hand_workflow import evident_result, read_by_hand
@@ -176,7 +176,7 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
     result, evident = evident_result(recording, replace(options, as_asked=False), provenance)
     if evident.found is None:
         raise too_few_poses(len(evident.hand.poses.start))
-    return DiagnosisResult(told_by_hand(evident.found, evident.hand), result.calibration, result.tolerances, result.needed,
+    return DiagnosisResult(diagnosis_by_hand(evident.found, evident.hand), result.calibration, result.tolerances, result.needed,
                            result.observations,
                            replace(options, accelerometer_model=options.accelerometer_model or BARE,
                                    gyroscope_model=options.gyroscope_model or BARE))

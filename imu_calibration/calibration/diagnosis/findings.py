@@ -268,10 +268,10 @@ def build_diagnosis(table: Table, found: Investigation, *, calibrated: Solution 
             return motions_of_one_joint(question, mate)
         return separating_motion(solution, question, mate, gravity=table.gravity_value)
 
-    told_by = calibrated or solution
-    findings = [_clipping(limit, told_by) for limit in limits]
+    reported = calibrated or solution
+    findings = [_clipping(limit, reported) for limit in limits]
     strange = found.implausible
-    findings += [finding(problem.search, named, place, solution=solution if named[place] in strange else told_by,
+    findings += [finding(problem.search, named, place, solution=solution if named[place] in strange else reported,
                          share=found.explained.share, gain_of=gain_of, motion_of=motion_of,
                          shows=shows, rivals=_rivals(found, named[place]))
                  for place in range(len(named))]
@@ -316,7 +316,7 @@ def _traces_of(baseline, hand):
                   errors[1], (poses.stop - poses.start).astype(float), None)
 
 
-def told_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
+def diagnosis_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
     """Return the result of an investigation as a Diagnosis; `hand` is a calibration with all findings."""
     problem, named = found.problem, list(found.named)
     before, after = _with_residuals(found.baseline), _with_residuals(hand)
