@@ -1,4 +1,4 @@
-"""Six faces and three full turns by hand: ours beside imucal on the same sections."""
+"""Six faces and three full turns by hand: this project compared with imucal on the same sections."""
 
 import numpy as np
 
@@ -37,7 +37,7 @@ def angles_between(matrix):
 
 
 def comparable(found, info):
-    """Return [(parameter, unit, ours, imucal's, our sd or None)]: what no choice of axes changes."""
+    """Return [(parameter, unit, ours, imucal's, our sd or None)]: the quantities that are independent of the choice of axes."""
     (bias_f, matrix_f), (bias_w, matrix_w, _) = found.accelerometer, found.gyroscope
     theirs_f, theirs_w = accelerometer_of(info), info.K_g @ info.R_g
     rows = []
@@ -80,7 +80,7 @@ def imucal_from_ours(found, up):
 
 
 def tilts(up):
-    """Return by how much each face was off the axis of our frame that it stands for, deg, shape (6,)."""
+    """Return the angle between each face and the axis of our frame that it represents, deg, shape (6,)."""
     wanted = np.repeat(np.eye(3), 2, axis=0) * np.tile([1, -1], 3)[:, None]
     return np.degrees(np.arccos(np.clip(np.sum(up * wanted, axis=1), -1, 1)))
 

@@ -1,4 +1,4 @@
-"""Who predicts better: ours, a plain gravity-norm fit and imucal on poses that took no part, the same poses for all."""
+"""Prediction errors of this project, a plain gravity-norm fit and imucal on the same held-out poses."""
 
 import numpy as np
 from scipy.stats import t
@@ -25,7 +25,7 @@ def without(imu, ranges, left_out):
     """
     Return (imu, ranges) as if the poses with the numbers `left_out` had never been recorded.
 
-    Their samples are cut out, so that nothing of them enters, neither as poses nor as parts of a longer turn.
+    Their samples are cut out, so that neither poses nor longer turns contain them.
     """
     keep = np.ones(len(imu), bool)
     for k in left_out:
@@ -41,7 +41,7 @@ def ours(imu, ranges, left_out, gravity):
 
 
 def errors_of_splits(imu, ranges, gravity, splits):
-    """Return {'ours', 'norm fit', 'uncalibrated': list of arrays}: ``|force| - g`` of the poses that each split leaves out."""
+    """Return {'ours', 'norm fit', 'uncalibrated': list of arrays}: ``|force| - g`` of the held-out poses of each split."""
     force, result = mean_forces(imu, ranges), {'ours': [], 'norm fit': [], 'uncalibrated': []}
     for left_out in splits:
         rest = np.setdiff1d(np.arange(len(ranges)), left_out)
@@ -68,7 +68,7 @@ def resampled_ratio(first, second, share):
     """
     Return (geometric mean of rms(second) / rms(first) over repeated splits of the same poses, its 95 % interval).
 
-    Splits share poses, so that the variance of the mean is taken as ``(1/J + n_test/n_train) var`` (Nadeau and Bengio 2003).
+    Splits share poses, so that the variance of the mean is ``(1/J + n_test/n_train) var`` (Nadeau and Bengio 2003).
     """
     ratios = np.log([rms(b) / rms(a) for a, b in zip(first, second)])
     half = t.ppf(0.975, len(ratios) - 1) * np.sqrt((1 / len(ratios) + share) * ratios.var(ddof=1))
@@ -83,7 +83,7 @@ def leave_one_out(imu, ranges, gravity, rng):
 
 
 def few_poses(imu, ranges, gravity, rng):
-    """Return ({method: median rms}, (ratio of norm fit to ours, interval)) with FEW poses for the fit and the others left out."""
+    """Return ({method: median rms}, (ratio of norm fit to ours, interval)) with FEW poses for the fit and the remaining ones held out."""
     splits = [np.sort(rng.permutation(len(ranges))[FEW:]) for _ in range(SPLITS)]
     found = errors_of_splits(imu, ranges, gravity, splits)
     ratio = resampled_ratio(found['ours'], found['norm fit'], (len(ranges) - FEW) / FEW)

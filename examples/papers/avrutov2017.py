@@ -59,7 +59,7 @@ def simultaneous_turn(angle: np.ndarray, axis: tuple[float, float, float] = (1.0
 
 
 def equal_angles(step_deg: float = 10.0, stop_deg: float = 400.0) -> np.ndarray:
-    """Return the paper's turn angles in rad: 0 to `stop_deg` with the end, 41 positions (the paper says 40)."""
+    """Return the paper's turn angles in rad: 0 to `stop_deg` with the end, 41 positions (40 in the paper)."""
     return np.deg2rad(np.arange(0.0, stop_deg + step_deg / 2, step_deg))
 
 
@@ -82,7 +82,7 @@ def gravity_readings(mat_bn: np.ndarray, gravity_axis: str, tilt_rad: Sequence[f
 
 
 def series_3() -> np.ndarray:
-    """Return the rates of sample 3, deg/s, shape (n, 3): w, w^(1/2), w^(1/3) for w = 0, 10 ... 100 (11 runs, the paper says 10)."""
+    """Return the rates of sample 3, deg/s, shape (n, 3): w, w^(1/2), w^(1/3) for w = 0, 10 ... 100 (11 runs, 10 in the paper)."""
     rate = np.arange(0.0, 101.0, 10.0)
     return np.column_stack([rate, np.sqrt(rate), np.cbrt(rate)])
 
@@ -143,7 +143,7 @@ def calibrate(inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear', *,
 
 
 def calibrate_as_printed(inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear') -> np.ndarray:
-    """Return X by the printed normal equations ``inv(G'G) G'U``, to show what they lose."""
+    """Return X by the printed normal equations ``inv(G'G) G'U``, for a comparison of their accuracy."""
     design = design_matrix(inputs, model)
     return np.linalg.inv(design.T @ design) @ design.T @ outputs
 
@@ -188,7 +188,7 @@ def calibrate_with_tilt(mat_bn: np.ndarray, outputs: np.ndarray, gravity_axis: s
 
 def reference_error(inputs: np.ndarray, input_changes: np.ndarray, coefficients: np.ndarray, *, model: str = 'linear') -> np.ndarray:
     """
-    Return what wrong reference inputs do to the coefficients: ``G^+ dG X``, shape (n_params, 3).
+    Return the errors of the coefficients from errors of the reference inputs: ``G^+ dG X``, shape (n_params, 3).
 
     The true inputs are ``inputs + input_changes``, the fit uses `inputs`. Exact, and rows may err together (tilt, Earth rate),
     which the paper's section V cannot express.
@@ -207,7 +207,7 @@ def m_test_sd(errors: np.ndarray, as_printed: bool = True) -> np.ndarray:
     """
     Return the root-mean-square error over m tests, as at the end of section V: ``sqrt(sum(error^2) / (m - 1))``, shape (...).
 
-    The errors are against known truth, so that nothing was estimated from them and m is right (`as_printed` False); m - 1 belongs to
+    The errors are against known truth, without an estimate from them, so that m is right (`as_printed` False); m - 1 belongs to
     differences from their own mean.
 
     Parameters
@@ -224,7 +224,7 @@ def m_test_sd(errors: np.ndarray, as_printed: bool = True) -> np.ndarray:
 def error_budget(inputs: np.ndarray, coefficients: np.ndarray, model: str = 'linear', *, noise_sd: float = 0.0,
                  common: dict[str, np.ndarray] | None = None, scattered: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
     """
-    Split the sd of every coefficient into its causes, which is what section V of the paper is after.
+    Split the sd of every coefficient into its causes (section V of the paper).
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ def error_budget(inputs: np.ndarray, coefficients: np.ndarray, model: str = 'lin
     common : dict of str to array, shape (n, 3) or (k, n, 3)
         Change of the inputs by one sd of a cause that all runs share (tilt: k = 2 directions, gravity, Earth rate).
     scattered : dict of str to array, shape (n, 3) or (k, n, 3)
-        Change of the inputs by one sd of a cause that is drawn anew in every run (encoder, rate resolution).
+        Change of the inputs by one sd of a cause that is drawn independently in every run (encoder, rate resolution).
 
     Returns
     -------

@@ -230,7 +230,7 @@ SEEN_DIAMETER = 0.03
 
 
 def cells_of(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...], float]]:
-    """Yield (place, colour, diameter) of each cell: orange and large where a rest is still worth having, green and small where not."""
+    """Yield (place, colour, diameter) of each cell: orange and large where a rest still has a gain, green and small elsewhere."""
     most = max(float(coverage.worth.max()), MIN_CELL_WORTH)
     for direction, worth in zip(DIRECTIONS, coverage.worth, strict=True):
         share = 0.0 if coverage.done or worth < MIN_CELL_WORTH else float(worth) / most

@@ -357,7 +357,7 @@ class LiveCalibration:
         return ImuSamples(window.stamp_ns[some], *(residuals[sensor][some] for sensor in SENSORS), self._collector.gathered.frame_id)
 
     def coverage(self) -> Coverage:
-        """Return the Coverage: which attitudes are worth having, which motion helps most."""
+        """Return the Coverage: the gain of each attitude, and the motion with the largest gain."""
         return replace(NOTHING_SEEN, frame_id=self.frame_id) if self.result is None else table_coverage(self.result, self.frame_id)
 
     def groups(self) -> list[GroupState]:

@@ -3,8 +3,8 @@ calibration_node: calibrates an IMU on a table while the table moves, or by hand
 
 in: imu/data_raw (sensor_msgs/Imu), joint_states (sensor_msgs/JointState, on a table), imu/temperature (sensor_msgs/Temperature, for thermal
 effects). out: imu/calibration (std_msgs/String, the calibration document, latched), imu/residual (sensor_msgs/Imu),
-imu/coverage (visualization_msgs/MarkerArray, latched: what is still worth having, where to go next), /diagnostics.
-services: ~/solve, ~/diagnose (at once; the answer comes on /diagnostics), ~/save, ~/reset.
+imu/coverage (visualization_msgs/MarkerArray, latched: the gain of each attitude, and the next motion), /diagnostics.
+services: ~/solve, ~/diagnose (returns at once; the result is published on /diagnostics), ~/save, ~/reset.
 """
 
 import sys

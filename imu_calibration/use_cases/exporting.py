@@ -17,7 +17,7 @@ def export_calibration(calibration: str | PathLike | Calibration, to: str, *, ou
                        noise: str | PathLike | None = None, rate: float | None = None, bag: str | PathLike | None = None,
                        stand: Stand | None = None, topics: Topics = Topics(), anyway: bool = False) -> Export:
     """
-    Write a calibration as another program wants it.
+    Write a calibration in the format of another program.
 
     Parameters
     ----------
