@@ -50,7 +50,7 @@ def show(figures):
     rows = [(name, error_text(f.force, 'm/s^2'), error_text(f.rate, 'rad/s'), f'{significant(f.velocity)} m/s', f'{significant(f.position)} m')
             for name, f in zip(('before', 'after'), figures)]
     print('\nErrors on a different session of the same IMU')
-    show_table(Terminal.standard(), ('', *numbers), rows, numbers=numbers)
+    show_table(Terminal.of(), ('', *numbers), rows, numbers=numbers)
 
 
 if __name__ == '__main__':
