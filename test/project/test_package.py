@@ -178,9 +178,8 @@ def test_the_oldest_versions_pinned_are_those_that_set_up_allows(installed):
         assert f'{tested}.'.startswith(f'{least}.'), requirement
 
 
-def test_the_readme_is_short_and_has_the_equation():
+def test_the_readme_has_the_equation():
     text = (ROOT / 'README.md').read_text()
-    assert len(text.split()) <= 900
     assert 'measured = bias + matrix @ (true + lever-arm terms) + further effects' in text
 
 
